@@ -1,7 +1,7 @@
-//! The worlds as the core of an actor: what is asked of them, and which projections end with their leases.
+//! The worlds as the core of an actor: requests to them, and the projections that end with their leases.
 //!
-//! A commit's answer, and what watchers are told of it, waits until it is on the disk. When commits cannot be written, every one is
-//! refused from then on; what can be read, and projected from, is what is on the disk.
+//! A commit's answer and its updates to watchers wait until the commit is on the disk. When commits cannot be written, every commit
+//! is refused from then on; reads and projections use the state that is on the disk.
 
 use super::core::{HeldBy, ProjectError, ProjectRequest, WorldPool};
 use super::history::{Between, Commit, History, Kept, Version};
@@ -28,13 +28,13 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-/// How often projections without a lease are looked at.
+/// Interval at which expired projections are removed.
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(1);
 
-/// When a watch that has ended may be asked for again.
+/// Retry delay of a watch that has ended.
 pub(super) const WATCH_AGAIN_AFTER: Duration = Duration::from_secs(1);
 
-/// What the service asks of the actor.
+/// Requests of the service.
 #[derive(Debug)]
 pub(super) enum Message {
     Commit {
@@ -43,7 +43,7 @@ pub(super) enum Message {
     },
     Project {
         projection: NewProjection,
-        /// So many ids are to be promised with it.
+        /// Number of ids to promise together with it.
         promise: u32,
         answer: Answer<(ProjectionId, Vec<ProjectionId>)>,
     },
@@ -55,13 +55,13 @@ pub(super) enum Message {
         answer: Answer<View>,
     },
     Watch {
-        /// Without a snapshot: the revisions after this.
+        /// With this revision no snapshot is sent, only the revisions after it.
         after: Option<Revision>,
         answer: Answer<mpsc::Receiver<Update>>,
     },
     Diff {
         from: Revision,
-        /// Unset, the root as it is.
+        /// `None` for the current root.
         to: Option<Revision>,
         answer: Answer<(Between, Revision)>,
     },
@@ -90,15 +90,15 @@ pub(super) enum Message {
 
 type Answer<T> = oneshot::Sender<Result<T, Status>>;
 
-/// What watchers are told, as long as the history keeps it: one that is slower does not make it keep more.
+/// An update for watchers. Weak, so that a slow watcher does not make the history keep more revisions.
 #[derive(Debug, Clone)]
 pub(super) enum Update {
-    /// What holds; every revision follows.
+    /// The facts of this revision; every later revision follows.
     Snapshot(Weak<Kept>),
     Revision(Weak<Kept>),
 }
 
-/// A projection as it was asked for.
+/// A projection as requested.
 #[derive(Debug)]
 pub(super) struct NewProjection {
     pub(super) by: Caller,
@@ -121,27 +121,27 @@ type WorldTurn = TurnContext<WorldCore>;
 pub(super) struct WorldCore {
     config: WorldPoolConfig,
     pool: WorldPool,
-    /// Contradictions that are to be told.
+    /// Contradictions that are still to be reported.
     contradicted: Vec<Contradiction>,
     /// Projections that somebody watches.
     watched: BTreeMap<ProjectionId, watch::Sender<Option<Contradiction>>>,
     leases: watch::Receiver<LiveLeases>,
-    /// What came before what it is about.
+    /// Messages that came before the projection or commit that they need.
     parked: Parked<Message>,
-    /// When projections without a lease are looked at next.
+    /// When expired projections are removed next.
     next_look: Timestamp,
 }
 
-/// What a commit leads to.
+/// Messages that a commit causes.
 #[derive(Debug)]
 pub(super) enum Said {
-    /// To everybody who watches.
+    /// To all watchers.
     News(Arc<Kept>),
-    /// To who watches the projection.
+    /// To those who watch the projection.
     Contradicted(Contradiction),
 }
 
-/// Starts the actor on what was kept. It ends with the token, when everything is on the disk.
+/// Starts the actor on the restored history. `over` ends it, when everything is on the disk.
 pub(super) fn start(
     config: WorldPoolConfig,
     ontology: Option<Ontology>,
@@ -257,7 +257,7 @@ impl Core for WorldCore {
         }
     }
 
-    /// A commit may have as many facts as a message holds.
+    /// A commit may have as many facts as a message can hold.
     fn is_large(message: &Message) -> bool {
         matches!(message, Message::Commit { .. })
     }
@@ -268,11 +268,12 @@ impl Core for WorldCore {
     }
 }
 
-/// Whether it is about something that is on its way.
+/// Whether a message needs a commit or projection that may still arrive.
 fn is_early(pool: &WorldPool, message: &Message) -> bool {
     match message {
         Message::Project { projection: NewProjection { by, id, after, .. }, .. } => {
-            // With an id of its own it is refused at once where that is not promised any more, as who asks for the projection is.
+            // A request with a projection id is refused at once where that id is not promised any more, and so is a query of that
+            // projection.
             let may_be = id.is_none_or(|id| pool.is_promised_to(by, id));
             may_be && after.as_ref().is_some_and(|commit| !pool.has_commit(by, commit))
         }
@@ -285,7 +286,7 @@ fn is_early(pool: &WorldPool, message: &Message) -> bool {
 }
 
 impl Message {
-    /// Whose it is, of those that may have to wait.
+    /// The caller of a message that may have to wait.
     fn whose(&self) -> Arc<str> {
         match self {
             Message::Project { projection, .. } => projection.by.name.clone(),
@@ -294,7 +295,7 @@ impl Message {
         }
     }
 
-    /// What it takes in memory, of those that may have to wait, about.
+    /// Approximate memory of a message that may have to wait, in bytes.
     fn bytes(&self) -> usize {
         let of = match self {
             Message::Project { projection, .. } => {
@@ -306,7 +307,7 @@ impl Message {
         size_of::<Message>() + of
     }
 
-    /// To who asked for something that is waited for.
+    /// Answers a message that waited with a refusal.
     fn refused(self, status: Status) {
         match self {
             Message::Project { answer, .. } => drop(answer.send(Err(status))),
@@ -319,7 +320,7 @@ impl Message {
 }
 
 impl WorldCore {
-    /// Performs what need not wait any more, and what that lets go on.
+    /// Performs the messages that need not wait any more, and those for which these made the way free.
     fn take_up(&mut self, context: &mut WorldTurn) {
         loop {
             let pool = &self.pool;
@@ -331,7 +332,7 @@ impl WorldCore {
         }
     }
 
-    // An answer that nobody waits for any more is of no consequence: commits and projections are idempotent by id.
+    // An answer whose receiver is gone does no harm: commits and projections are idempotent by id.
     fn perform(&mut self, message: Message, context: &mut WorldTurn) {
         match message {
             Message::Commit { commit, answer } => {
@@ -404,7 +405,7 @@ impl WorldCore {
     }
 
     fn project(&mut self, new: NewProjection, now: Timestamp) -> Result<ProjectionId, Status> {
-        // Looked at here and not where the call came in: a lease that ends from now on ends the projection, too.
+        // Checked here and not in the service: a lease that ends from now on ends the projection, too.
         let held_by = match new.lease {
             None => HeldBy::Until(now + self.pool.unbound_ttl()),
             Some(lease) => match self.leases.borrow().known(lease) {
@@ -504,12 +505,12 @@ mod tests {
         };
         let (seen, made, committed) = tokio::join!(look(ids[0]), project("one", Some(ids[0]), Some("a")), commit);
         assert_eq!((seen, made.unwrap().0, committed.unwrap().0), (Ok(Revision(1)), ids[0], Revision(1)));
-        // In vain.
+        // What these two wait for never comes.
         let began = std::time::Instant::now();
         let (seen, made) = tokio::join!(look(ids[1]), project("two", None, Some("b")));
         assert_eq!((seen, made.unwrap_err().code()), (Err(Code::Unavailable), Code::FailedPrecondition));
         assert!(began.elapsed() >= super::super::parked::PATIENCE);
-        // Of another pool before this one: neither waits in vain.
+        // The id is one of an earlier pool: neither call waits.
         let (seen, made) = tokio::time::timeout(Duration::from_millis(900), async {
             tokio::join!(look(ProjectionId(77)), project("three", Some(ProjectionId(77)), Some("b")))
         })

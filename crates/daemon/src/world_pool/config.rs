@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
-/// How long a fact may live.
+/// Allowed times to live of a fact, in seconds.
 const TTLS_S: RangeInclusive<f64> = 0.001..=1e9;
 
 const MIB: usize = 1 << 20;
@@ -22,49 +22,51 @@ const MIB: usize = 1 << 20;
 pub struct WorldPoolConfig {
     /// Where to listen; `local` is a Unix socket in the runtime directory.
     pub listen: Endpoint,
-    /// The name of this host: the end of its resource's id, `world-model@compute`.
+    /// The name of this host: the end of the id of the pool's resource, `world-model@compute`.
     pub host: String,
-    /// Where the resource manager is; without it, where the runtime directory says.
+    /// Address of the resource manager; without it the address in the runtime directory is used.
     pub resource_manager: Option<Endpoint>,
-    /// The session lives this long without an answer from the resource manager, in milliseconds.
+    /// Time to live of the session without an answer from the resource manager, in milliseconds.
     pub session_ttl_ms: u64,
-    /// The kind of its resource.
+    /// The kind of the pool's resource.
     pub kind: String,
-    /// Units of its resource: so many projections can be held by leases at once.
+    /// Units of the pool's resource: this many projections can be held by leases at once.
     pub capacity: u32,
-    /// So many revisions of the root are kept, to project from and to look back at.
+    /// Maximum number of kept revisions of the root, for projections and for the history.
     pub revisions_kept: usize,
-    /// And at most so many that have written so many facts together; the root itself is always kept.
+    /// Maximum number of facts that the kept revisions have written together; the root itself is always kept.
     pub changes_kept: usize,
-    /// And at most so many as take so many bytes of memory besides the root, about.
+    /// Approximate maximum memory of the kept revisions besides the root, in bytes.
     pub revision_bytes: usize,
-    /// Projections at once in all, those without a lease included.
+    /// Maximum number of projections at once, those without a lease included.
     pub max_projections: usize,
-    /// Of those, projections of one caller that is no operator.
+    /// Part of these for one caller that is not an operator.
     pub projections_per_caller: usize,
-    /// Of `max_projections`, so many are only for operators, but never more than half.
+    /// Part of `max_projections` that is only for operators, never more than half.
     pub projections_for_operators: usize,
-    /// Bytes of memory of all projections, about, with what of forgotten revisions is there for them alone; a quarter is only for operators.
+    /// Approximate maximum memory of all projections in bytes, with the facts of forgotten revisions that are kept for them alone; a quarter
+    /// is only for operators.
     pub projection_bytes: usize,
-    /// Of those, bytes of the projections of one caller that is no operator.
+    /// Part of these bytes for the projections of one caller that is not an operator.
     pub projection_bytes_per_caller: usize,
-    /// A projection whose lease holds no resource ends after this long, in seconds.
+    /// A projection whose lease holds no resource ends after this time, in seconds.
     pub unbound_ttl_s: f64,
-    /// Clients that watch at the same time.
+    /// Maximum number of watching clients.
     pub max_watchers: usize,
-    /// Bytes of one fact with its evidence, as it is written on the wire.
+    /// Maximum bytes of one fact with its evidence, as encoded on the wire.
     pub fact_bytes: usize,
-    /// Bytes of all changes of one commit or projection, at most 8 MiB.
+    /// Maximum bytes of all changes of one commit or projection, at most 8 MiB.
     pub commit_bytes: usize,
-    /// A file in Turtle: what does not fit it is not committed, and facts live as long as it declares.
+    /// An ontology file in Turtle: facts that do not conform to it are not committed, and facts live as long as it declares.
     pub ontology: Option<PathBuf>,
-    /// Seconds by predicate, instead of what the ontology declares: a fact that is not written again within them is gone.
+    /// Time to live in seconds by predicate, in place of the ontology's: a fact that is not written again in that time is deleted.
     pub ttl_s: BTreeMap<String, f64>,
-    /// Commits, and projections, remembered so that a repeated id is not performed twice; the caller with the most loses the oldest.
+    /// Maximum number of remembered commits, and of remembered projections, so that a repeated id is not performed twice; the caller with
+    /// the most loses the oldest.
     pub remembered_requests: usize,
-    /// Of those, of one caller, who loses the oldest.
+    /// Part of these for one caller, who loses its oldest.
     pub remembered_per_caller: usize,
-    /// What is kept over a restart.
+    /// The durable state.
     pub storage: StorageConfig,
 }
 

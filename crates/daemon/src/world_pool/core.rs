@@ -1,8 +1,8 @@
-//! The root's history and the projections of it: a pure state machine.
+//! The root's history and its projections: a pure state machine.
 //!
-//! A projection is a clone of a kept revision with its changes applied, so it costs its effects, whatever the size of the
-//! world. It shows its declared reads and nothing else, and it ends with its lease. Whoever made it releases it, or an operator. The history
-//! is durable, projections are not: they end with the process, and no later one has the id of an earlier one.
+//! A projection is a clone of a kept revision with its changes applied, so it costs as much as its effects, whatever the size of the world. It
+//! shows only its declared reads, and it ends with its lease. Its creator or an operator can release it. The history is durable, projections
+//! are not: they end with the process, and no later projection gets the id of an earlier one.
 
 use super::WorldPoolConfig;
 use super::expiry::Expiry;
@@ -38,15 +38,15 @@ pub(super) struct WorldPool {
     expiry: Expiry,
     tolerances: Tolerances,
     pub(super) projections: BTreeMap<ProjectionId, Projection>,
-    /// What planners were sent.
+    /// The scenes that were sent to planners.
     pub(super) scenes: Scenes,
-    /// What those show that nothing has contradicted yet, to compare with what is committed.
+    /// Projections that nothing has contradicted yet, to compare with commits.
     live: Live<ProjectionId>,
-    /// Since [`WorldPool::take_contradictions`].
+    /// Contradictions since the last [`WorldPool::take_contradictions`].
     contradictions: Vec<Contradiction>,
     projected: Memory<ProjectionId>,
     by_lease: BTreeMap<LeaseId, BTreeSet<ProjectionId>>,
-    /// What each caller has of them.
+    /// Memory of each caller's projections.
     in_memory: InMemory,
     last_projection: u64,
     promised: Promised,
@@ -56,24 +56,24 @@ pub(super) struct WorldPool {
 pub(super) struct Projection {
     pub(super) world: World,
     pub(super) base: Revision,
-    /// What of its changes moves something of the scene.
+    /// Its changes that move something in the scene.
     pub(super) moves: Vec<Change>,
     pub(super) reads: Footprint,
     held_by: HeldBy,
     made_by: Arc<str>,
     request_id: String,
-    /// What it takes of its own.
+    /// Bytes of its own.
     bytes: usize,
-    /// Once there is one, it is compared with no more commits.
+    /// A projection with a contradiction is not compared with further commits.
     contradiction: Option<Contradiction>,
 }
 
-/// What a projection lives as long as.
+/// What keeps a projection alive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum HeldBy {
     /// A live lease of the resource manager.
     Lease(LeaseId),
-    /// Nothing but time.
+    /// No lease: it ends at this time.
     Until(Timestamp),
 }
 
@@ -82,13 +82,13 @@ pub(super) enum HeldBy {
 pub(super) struct ProjectRequest {
     pub(super) by: Caller,
     pub(super) request_id: String,
-    /// One that was promised to the caller; the pool picks one otherwise.
+    /// An id that was promised to the caller; `None` lets the pool choose.
     pub(super) id: Option<ProjectionId>,
-    /// A commit of the caller's: the base is the revision that it made, or a later one.
+    /// A commit of the caller: the base is the revision that this commit made, or a later one.
     pub(super) after: Option<String>,
     pub(super) base: Revision,
     pub(super) changes: Vec<Change>,
-    /// Who will make the change at the same place; empty or missing: nobody.
+    /// The node that will make the change at the same index; empty or missing if unknown.
     pub(super) writers: Vec<Arc<str>>,
     pub(super) reads: Footprint,
     pub(super) held_by: HeldBy,
@@ -108,7 +108,7 @@ fn wire(found: ratn_world::reads::Contradiction<ProjectionId>, revision: Revisio
     Contradiction { projection, fact, was, is, revision }
 }
 
-/// A projection that was not made.
+/// Why a projection was not made.
 #[derive(Debug, PartialEq, thiserror::Error)]
 pub(super) enum ProjectError {
     #[error(transparent)]
@@ -147,7 +147,7 @@ pub(super) enum ProjectError {
     NoSuchCommit { id: String, caller: Arc<str> },
 }
 
-/// A projection that somebody else made.
+/// A projection that another caller made.
 #[derive(Debug, PartialEq, thiserror::Error)]
 #[error("{id} is of {made_by}: only they and operators release it, not {caller}")]
 pub(super) struct MadeByAnother {
@@ -156,7 +156,7 @@ pub(super) struct MadeByAnother {
     caller: Arc<str>,
 }
 
-/// A question without an answer.
+/// Why a query has no answer.
 #[derive(Debug, PartialEq, thiserror::Error)]
 pub(super) enum QueryError {
     #[error("{id} is unknown or has ended (its lease ended, or it was released)")]
@@ -172,7 +172,7 @@ pub(super) enum QueryError {
 }
 
 impl WorldPool {
-    /// Projections get ids above `floor`. With an ontology only what fits it is committed, and its times to live hold where the config
+    /// Projections get ids above `floor`. With an ontology only conforming commits are accepted, and its times to live apply where the config
     /// has none.
     pub(super) fn new(config: WorldPoolConfig, ontology: Option<Ontology>, history: History, floor: u64) -> WorldPool {
         let declared = ontology.iter().flat_map(Ontology::predicates);
@@ -203,14 +203,14 @@ impl WorldPool {
         self.history.root()
     }
 
-    /// All changes as the next revision, or none. An id committed before gets its answer again.
+    /// Commits all changes as the next revision, or none of them. A repeated id gets its first answer again.
     pub(super) fn commit(&mut self, now: Timestamp, commit: &Commit) -> Result<Revision, CommitError> {
         let before = self.root().clone();
         let revision = self.history.commit(commit, self.ontology.as_ref())?;
         for (forgotten, next) in self.history.take_forgotten() {
             self.in_memory.forgotten(&forgotten, &next);
         }
-        // An answer of before has written nothing now.
+        // A repeated answer has written nothing now.
         if let Some(kept) = self.history.newest().filter(|kept| kept.world.revision() > before.revision()) {
             self.expiry.written(now, &kept.written);
             let tolerance = |predicate: &str| self.tolerances.of(predicate, Tolerance::EXACT);
@@ -228,22 +228,22 @@ impl WorldPool {
         Ok(revision)
     }
 
-    /// The projections that the revisions since the last call contradict.
+    /// The contradictions that the revisions since the last call have caused.
     pub(super) fn take_contradictions(&mut self) -> Vec<Contradiction> {
         std::mem::take(&mut self.contradictions)
     }
 
-    /// What has contradicted a projection, if something has.
+    /// The contradiction of a projection, if there is one.
     pub(super) fn contradiction(&self, id: ProjectionId) -> Result<Option<&Contradiction>, QueryError> {
         Ok(self.projection(id)?.contradiction.as_ref())
     }
 
-    /// Whether a projection is there.
+    /// Whether a projection exists.
     pub(super) fn has(&self, id: ProjectionId) -> bool {
         self.projections.contains_key(&id)
     }
 
-    /// What the revisions after its base have contradicted already, and which of its effects have not come true yet.
+    /// The contradiction that the revisions after its base have caused already, and the effects that have not come true yet.
     fn catch_up(
         &self,
         id: ProjectionId,
@@ -277,7 +277,7 @@ impl WorldPool {
         self.expiry.next()
     }
 
-    /// The facts whose time is over are gone, all as one revision.
+    /// Deletes the facts whose time to live is over, all in one revision.
     pub(super) fn expire_facts(&mut self, now: Timestamp) {
         let changes = self.expiry.due(now);
         if changes.is_empty() {
@@ -289,7 +289,7 @@ impl WorldPool {
         }
     }
 
-    /// Every fact has its whole time from now on.
+    /// Restarts the time to live of every fact.
     fn all_begin(&mut self, now: Timestamp) {
         self.expiry.clear();
         if !self.expiry.is_empty() {
@@ -299,7 +299,7 @@ impl WorldPool {
         }
     }
 
-    /// Another history instead, which may be behind: what was projected from later revisions ends.
+    /// Replaces the history by one that may be behind: projections of later revisions end.
     pub(super) fn replace_history(&mut self, now: Timestamp, history: History) {
         self.history = history;
         self.scenes.forget();
@@ -327,17 +327,17 @@ impl WorldPool {
         self.projections.get(&id).ok_or_else(|| self.missing(id))
     }
 
-    /// What is said of a projection that is not there.
+    /// The error for a projection that does not exist.
     pub(super) fn missing(&self, id: ProjectionId) -> QueryError {
         if self.promised.has(id) { QueryError::NotYet { id } } else { QueryError::Unknown { id } }
     }
 
-    /// Whether a commit of the caller's is known.
+    /// Whether a commit of the caller is known.
     pub(super) fn has_commit(&self, caller: &Caller, id: &str) -> bool {
         self.history.commit_of(&caller.name, id).is_some()
     }
 
-    /// Whether the projection is promised and not there yet.
+    /// Whether the projection is promised and does not exist yet.
     pub(super) fn is_promised(&self, id: ProjectionId) -> bool {
         self.promised.has(id)
     }
@@ -347,8 +347,9 @@ impl WorldPool {
         self.promised.whose(id) == Some(&caller.name)
     }
 
-    /// The world at a revision with changes applied. A request made before gets its answer again, as long as it lives. An id that was promised
-    /// for it is used up, whatever comes of it, so that who waits for it need not wait longer; not where only its commit is not there yet.
+    /// The world at a revision with changes applied. A repeated request gets its first answer again, as long as that projection lives. A
+    /// promised id is used up even where the projection fails, so that nobody waits for it longer; it stays promised only where its commit is
+    /// still missing.
     pub(super) fn project(&mut self, request: ProjectRequest) -> Result<ProjectionId, ProjectError> {
         let (id, by) = (request.id, request.by.name.clone());
         let made = self.make(request);
@@ -376,7 +377,7 @@ impl WorldPool {
             request.base = made.ok_or_else(missing)?.max(request.base);
         }
         let moves = moves(&request.changes);
-        // The changes are there once more for what a commit contradicts, the reads for who is asked then.
+        // The changes are stored again for comparison with commits, and the reads again to find the projections to compare.
         let mut bytes =
             size::of_changes(&request.changes) + size::of_changes(&moves) + 3 * size::of_footprint(&request.reads);
         let base = self.history.at(request.base)?;
@@ -413,7 +414,7 @@ impl WorldPool {
         Ok(id)
     }
 
-    /// Whether a caller may make one more.
+    /// Whether a caller may make another projection.
     fn check_room(&self, caller: &Caller) -> Result<(), ProjectError> {
         let WorldPoolConfig { max_projections, projections_per_caller, projections_for_operators, .. } = self.config;
         if self.projections.len() >= max_projections {
@@ -432,7 +433,7 @@ impl WorldPool {
         Ok(())
     }
 
-    /// Whether a caller may make one of so many bytes more.
+    /// Whether a caller may make a projection of this many bytes.
     fn check_bytes(&self, caller: &Caller, bytes: usize) -> Result<(), ProjectError> {
         let most = self.config.most_in_memory();
         let room = self.in_memory.check(&caller.name, caller.is_operator(), bytes, most);
@@ -443,7 +444,7 @@ impl WorldPool {
         })
     }
 
-    /// What a query of these patterns looks at: the root (now or at a revision) or a projection, and what that shows.
+    /// What a query of these patterns may look at: the root (now or at a revision) or a projection, and its visible facts.
     pub(super) fn view(
         &self,
         id: Option<ProjectionId>,
@@ -506,19 +507,19 @@ impl WorldPool {
         true
     }
 
-    /// Ends what the lease held; how many projections that were.
+    /// Ends the projections of the lease; returns their number.
     pub(super) fn end_lease(&mut self, lease: LeaseId) -> usize {
         let ids = self.by_lease.get(&lease).cloned().unwrap_or_default();
         ids.into_iter().filter(|id| self.release(*id)).count()
     }
 
-    /// Ends what leases held that live no more.
+    /// Ends the projections of leases that are no longer live.
     pub(super) fn keep_leases(&mut self, live: impl Fn(LeaseId) -> bool) -> usize {
         let ended: Vec<LeaseId> = self.by_lease.keys().copied().filter(|lease| !live(*lease)).collect();
         ended.into_iter().map(|lease| self.end_lease(lease)).sum()
     }
 
-    /// Ends what is held by nothing but time that has passed.
+    /// Ends the projections without a lease, and the promises, whose time is over.
     pub(super) fn expire(&mut self, now: Timestamp) {
         self.promised.expire(now);
         let over = |projection: &Projection| matches!(projection.held_by, HeldBy::Until(end) if end <= now);

@@ -1,6 +1,6 @@
-//! Facts that are stale after a time: which, and when.
+//! The expiry of facts: which facts have a time to live, and when it is over.
 //!
-//! What is written has its predicate's time once more; what is restored, too, for no clock goes on over a restart.
+//! Writing a fact restarts its time to live; so does a restore, because no clock continues over a restart.
 
 use ratn_model::fact::{Change, FactKey, FactPattern};
 use ratn_model::time::Timestamp;
@@ -12,7 +12,7 @@ use std::time::Duration;
 /// See the module.
 #[derive(Debug, Default)]
 pub(super) struct Expiry {
-    /// By predicate.
+    /// Times to live by predicate.
     ttl: BTreeMap<String, Duration>,
     ends: BTreeMap<Arc<FactKey>, Timestamp>,
     order: BTreeSet<(Timestamp, Arc<FactKey>)>,
@@ -23,12 +23,12 @@ impl Expiry {
         Expiry { ttl, ..Expiry::default() }
     }
 
-    /// Whether no fact ever is stale.
+    /// Whether no fact ever expires.
     pub(super) fn is_empty(&self) -> bool {
         self.ttl.is_empty()
     }
 
-    /// What was written now.
+    /// Facts that were written now.
     pub(super) fn written(&mut self, now: Timestamp, written: &Written) {
         for (key, fact) in written {
             self.forget(key);
@@ -38,7 +38,7 @@ impl Expiry {
         }
     }
 
-    /// A fact has its whole time from now on.
+    /// Restarts the time to live of a fact.
     pub(super) fn begin(&mut self, now: Timestamp, key: &Arc<FactKey>) {
         if let Some(ttl) = self.ttl.get(&key.predicate) {
             let end = now + *ttl;
@@ -47,18 +47,18 @@ impl Expiry {
         }
     }
 
-    /// When the next one is stale.
+    /// When the next fact expires.
     pub(super) fn next(&self) -> Option<Timestamp> {
         self.order.first().map(|(end, _)| *end)
     }
 
-    /// What is stale now is gone.
+    /// The deletions of the facts that have expired.
     pub(super) fn due(&self, now: Timestamp) -> Vec<Change> {
         let due = self.order.iter().take_while(|(end, _)| *end <= now);
         due.map(|(_, key)| Change::Delete { pattern: FactPattern::of(key) }).collect()
     }
 
-    /// No fact has a time any more.
+    /// Forgets the times of all facts.
     pub(super) fn clear(&mut self) {
         self.ends.clear();
         self.order.clear();

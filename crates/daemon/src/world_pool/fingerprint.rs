@@ -1,8 +1,8 @@
-//! Fingerprints of requests: two requests are the same if the hash of their messages is.
+//! Fingerprints of requests: two requests are the same if the hashes of their messages are.
 //!
-//! It is kept over a restart and over an upgrade, so it must not depend on how this program writes its types down. The wire form does
-//! not: fields have numbers, a field with its default value is not there, and maps are in the order of their keys. A field that
-//! is added changes nothing for a request without it.
+//! A fingerprint is kept over restarts and upgrades, so it must not depend on how this program serializes its types. The wire form is
+//! stable: fields have numbers, a field with its default value is absent, and maps are sorted by key. A field that is added changes nothing
+//! for a request without it.
 
 use prost::Message;
 use ratn_model::fact::{Change, Footprint};
@@ -11,23 +11,21 @@ use ratn_proto::v1;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// FNV-1a over 128 bits; clients are not adversaries of themselves. 0 is a fingerprint that is not known: of a version that hashed
-/// something else.
+/// FNV-1a over 128 bits; clients do not attack themselves. 0 is an unknown fingerprint: one of a version that hashed something else.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Fingerprint(u128);
 
 impl Fingerprint {
-    /// Of what an earlier version remembers in a form of its own: the id alone says that it is the same request.
+    /// Fingerprint of requests that an earlier version remembers in another form: only the id tells that they are the same.
     pub(super) const UNKNOWN: Fingerprint = Fingerprint(0);
 
-    /// Of the changes of a commit.
+    /// Fingerprint of the changes of a commit.
     pub(super) fn of_commit(changes: &[Change]) -> Fingerprint {
         let changes = all(changes.iter().cloned());
         Fingerprint::of("commit 1", &v1::CommitRequest { changes, ..v1::CommitRequest::default() })
     }
 
-    /// Of a projection; the lease that it hangs on, and the revision from which its caller knows that all is in it, may be others when it is
-    /// asked for again.
+    /// Fingerprint of a projection. Its lease and its base revision are left out: they may differ when it is requested again.
     pub(super) fn of_projection(changes: &[Change], reads: &Footprint, writers: &[Arc<str>]) -> Fingerprint {
         let message = v1::ProjectRequest {
             changes: all(changes.iter().cloned()),
@@ -38,7 +36,7 @@ impl Fingerprint {
         Fingerprint::of("projection 2", &message)
     }
 
-    /// Of a message; `form` names what is hashed, with a number that grows when something else is.
+    /// Fingerprint of a message; `form` names what is hashed, with a number that grows when that changes.
     pub(super) fn of(form: &str, message: &impl Message) -> Fingerprint {
         const OFFSET: u128 = 0x6c62_272e_07bb_0142_62b8_2175_6295_c58d;
         const PRIME: u128 = 0x0000_0000_0100_0000_0000_0000_0000_013b;
@@ -48,7 +46,7 @@ impl Fingerprint {
         Fingerprint(hash.max(1))
     }
 
-    /// Whether both can be of the same request.
+    /// Whether both can belong to the same request.
     pub(super) fn may_be(self, other: Fingerprint) -> bool {
         self == other || self == Fingerprint::UNKNOWN || other == Fingerprint::UNKNOWN
     }
@@ -74,8 +72,8 @@ mod tests {
         vec![set(Value::Map(fields)), Change::Increase { fact: total, by: -2.5 }, Change::Delete { pattern: gone }]
     }
 
-    /// These are in the states of installations: another hash refuses the retries of requests from before an upgrade. A change of
-    /// the form takes another tag, and the old one is known as of the old form.
+    /// These are in the states of installations: another hash refuses the retries of requests from before an upgrade. A change of the form
+    /// needs another tag, and the old fingerprints count as those of the old form.
     #[test]
     fn the_hashes_of_commits_are_those_of_every_version() {
         let hash = |changes: &[Change]| format!("{:032x}", Fingerprint::of_commit(changes).0);

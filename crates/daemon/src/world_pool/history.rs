@@ -1,7 +1,7 @@
-//! The root world, the revisions of it that are kept, and the commits that are remembered: what is durable of the pool.
+//! The root world, its kept revisions and the remembered commits: the durable part of the pool.
 //!
-//! Every revision shares what it has not changed with the one before it, so keeping one costs what it wrote. What a commit came to
-//! is put down as a record, which the journal takes; a snapshot and the records after it make the same history again.
+//! Each revision shares what it has not changed with the one before, so keeping it costs what it wrote. The result of a commit
+//! becomes a record, which the journal writes; a snapshot and the records after it restore the same history.
 
 use super::WorldPoolConfig;
 use super::fingerprint::Fingerprint;
@@ -25,43 +25,43 @@ use std::sync::Arc;
 /// See the module.
 #[derive(Debug, Clone)]
 pub(super) struct History {
-    /// The oldest first; the last is the root. Never empty.
+    /// Oldest first; the last is the root. Never empty.
     revisions: VecDeque<Arc<Kept>>,
-    /// How many facts the kept revisions wrote, the oldest not counted.
+    /// Number of facts that the kept revisions wrote, without the oldest revision.
     written: usize,
-    /// What they take besides the root, in bytes; the oldest not counted.
+    /// Bytes of the kept revisions besides the root, without the oldest revision.
     bytes: usize,
     commits: Memory<Revision>,
-    /// Commits since the journal took the last.
+    /// Commits that the journal has not taken yet.
     records: EntryRecord,
-    /// Revisions since [`History::take_news`].
+    /// Revisions since the last [`History::take_news`].
     news: Vec<Arc<Kept>>,
-    /// Revisions that are not kept any more since [`History::take_forgotten`].
+    /// Revisions that were dropped since the last [`History::take_forgotten`].
     forgotten: Vec<Arc<Kept>>,
     revisions_kept: usize,
     changes_kept: usize,
     revision_bytes: usize,
 }
 
-/// What is to become the next revision.
+/// The changes of the next revision.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Commit {
-    /// Who commits; the pool itself where facts were too old.
+    /// The committing caller; the pool itself where facts expired.
     pub(super) by: Caller,
-    /// Unique to what the caller commits; the same once more gets the answer of before. Empty where facts were too old.
+    /// Unique among the caller's commits; a repeated commit gets its first answer. Empty where facts expired.
     pub(super) id: String,
     pub(super) changes: Vec<Change>,
-    /// What the next revision has to be.
+    /// The number that the next revision has to have.
     pub(super) expected: Option<Revision>,
     pub(super) writer: Option<String>,
-    /// What measured which of the facts that are written.
+    /// Measurements of facts that are written.
     pub(super) evidence: Vec<(FactKey, Measurement)>,
 }
 
 /// A fact in two revisions.
 pub(super) type Difference = (Arc<FactKey>, Option<Arc<Fact>>, Option<Arc<Fact>>);
 
-/// Two revisions to be compared: that may take long, so it is done away from the actor's thread.
+/// Two revisions to compare. That may take long, so it is not done in the actor's thread.
 #[derive(Debug)]
 pub(super) struct Between {
     before: World,
@@ -70,7 +70,7 @@ pub(super) struct Between {
 }
 
 impl Between {
-    /// The facts that differ, in the order of keys: what was written in between and is not as it was.
+    /// The facts that differ, in the order of keys: facts that were written in between and have another value.
     pub(super) fn differences(&self) -> impl Iterator<Item = Difference> {
         let keys: BTreeSet<&Arc<FactKey>> = self.written.iter().flat_map(|kept| kept.written.keys()).collect();
         let shared = |world: &World, key| world.fact(key).map(|fact| Arc::new(fact.clone()));
@@ -87,11 +87,11 @@ pub(super) struct Version {
     /// The commit's id; empty where it is not kept any more.
     pub(super) commit: Arc<str>,
     pub(super) fact: Option<Arc<Fact>>,
-    /// Who wrote or deleted it.
+    /// The node that wrote or deleted it.
     pub(super) writer: Option<Arc<str>>,
 }
 
-/// A revision, and what makes it another than the one before.
+/// A revision, and its difference from the one before.
 #[derive(Debug)]
 pub(super) struct Kept {
     pub(super) world: World,
@@ -100,18 +100,18 @@ pub(super) struct Kept {
     /// The node that made it.
     pub(super) writer: Option<Arc<str>>,
     pub(super) written: Written,
-    /// What it takes to keep the revision before, too: the keys that were written, and what they said before.
+    /// Bytes that it takes to keep the revision before as well: the written keys and their former facts.
     bytes: usize,
 }
 
 impl Kept {
-    /// A revision that is as it is for reasons that are not kept.
+    /// A revision whose commit is not kept.
     fn given(world: World) -> Arc<Kept> {
         Arc::new(Kept { world, commit: Arc::default(), writer: None, written: Written::new(), bytes: 0 })
     }
 }
 
-/// A commit that was not made; the root is as it was.
+/// Why a commit was not made; the root is unchanged.
 #[derive(Debug, PartialEq, thiserror::Error)]
 pub(super) enum CommitError {
     #[error("the root is at revision {root}: a commit makes {next}, not {expected}; read the root again")]
@@ -128,7 +128,7 @@ pub(super) enum CommitError {
     TooManyLooks(#[from] TooManyLooks),
 }
 
-/// A revision that is not kept.
+/// Why a revision is not available.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(super) enum RevisionError {
     #[error("the root is at revision {root}: there is no revision {wanted} yet")]
@@ -137,7 +137,7 @@ pub(super) enum RevisionError {
     Forgotten { wanted: u64, oldest: u64, root: u64 },
 }
 
-/// Why a log is no history.
+/// Why a log cannot be restored as a history.
 #[derive(Debug, PartialEq, thiserror::Error)]
 pub(super) enum RestoreError {
     #[error("the snapshot means nothing")]
@@ -171,7 +171,7 @@ impl History {
         }
     }
 
-    /// The history of a snapshot and the entries after it.
+    /// Restores the history from a snapshot and the entries after it.
     pub(super) fn restore(recovered: Recovered, config: &WorldPoolConfig) -> Result<History, RestoreError> {
         let mut names = Names::default();
         let mut history = History::new(config);
@@ -205,8 +205,8 @@ impl History {
         Ok(history)
     }
 
-    /// What comes next is above `floor`: revisions that somebody may have heard of, and that are lost, do not come again. What was
-    /// before is not known any more.
+    /// Continues above `floor`, so that numbers of lost revisions that clients may have heard of are not used again. Earlier
+    /// revisions are dropped.
     pub(super) fn with_revisions_above(mut self, floor: Revision) -> History {
         if self.root().revision() < floor {
             self.go_on_from(floor);
@@ -229,11 +229,11 @@ impl History {
     }
 
     pub(super) fn root(&self) -> &World {
-        // One revision is always kept.
+        // At least one revision is always kept.
         &self.revisions[self.revisions.len() - 1].world
     }
 
-    /// All changes as the next revision, or none. An id committed before gets its answer again.
+    /// Commits all changes as the next revision, or none of them. A repeated id gets its first answer again.
     pub(super) fn commit(&mut self, commit: &Commit, ontology: Option<&Ontology>) -> Result<Revision, CommitError> {
         let Commit { by, id, changes, expected, writer, evidence } = commit;
         let fingerprint = Fingerprint::of_commit(changes);
@@ -277,14 +277,14 @@ impl History {
         Ok(Revision(next))
     }
 
-    /// The revisions that commits since the last call have pushed out, the oldest first, each with the one behind it.
+    /// The revisions that commits since the last call have pushed out, oldest first, each with its successor.
     pub(super) fn take_forgotten(&mut self) -> Vec<(Arc<Kept>, Arc<Kept>)> {
         let forgotten = std::mem::take(&mut self.forgotten);
         let behind = forgotten.iter().skip(1).chain(self.revisions.front()).cloned().collect::<Vec<_>>();
         forgotten.into_iter().zip(behind).collect()
     }
 
-    /// The revision that a commit of this caller has made, as long as that is remembered.
+    /// The revision that a commit of this caller has made, as long as it is remembered.
     pub(super) fn commit_of(&self, caller: &Arc<str>, id: &str) -> Option<Revision> {
         self.commits.of(caller, id)
     }
@@ -299,7 +299,7 @@ impl History {
         kept.map(|kept| &kept.world).ok_or(RevisionError::Forgotten { wanted, oldest, root })
     }
 
-    /// The root as it is kept.
+    /// The current root as a kept revision.
     pub(super) fn newest(&self) -> Option<&Arc<Kept>> {
         self.revisions.back()
     }
@@ -309,21 +309,21 @@ impl History {
         std::mem::take(&mut self.news)
     }
 
-    /// Every revision after one.
+    /// Every revision after `revision`.
     pub(super) fn after(&self, revision: Revision) -> Result<impl Iterator<Item = &Arc<Kept>>, RevisionError> {
         self.at(revision)?;
         let known = self.revisions.iter().skip(1);
         Ok(known.skip_while(move |kept| kept.world.revision() <= revision))
     }
 
-    /// Two revisions, and what was written in between.
+    /// Two revisions, and the revisions between them.
     pub(super) fn between(&self, from: Revision, to: Revision) -> Result<Between, RevisionError> {
         let (before, after) = (self.at(from)?.clone(), self.at(to)?.clone());
         let written = self.after(from.min(to))?.take_while(|kept| kept.world.revision() <= from.max(to));
         Ok(Between { written: written.map(Arc::clone).collect(), before, after })
     }
 
-    /// What a fact was, the newest first, and the oldest revision that is kept.
+    /// The versions of a fact, newest first, and the oldest kept revision.
     pub(super) fn versions(&self, key: &FactKey, limit: usize) -> (Vec<Version>, Revision) {
         let oldest = &self.revisions[0].world;
         let written = self.revisions.iter().rev().filter_map(|kept| {
@@ -340,7 +340,7 @@ impl History {
         (written.chain(before).take(limit).collect(), oldest.revision())
     }
 
-    /// The revisions that are not kept any more for a new one, the oldest first.
+    /// Adds a revision; returns the revisions that it pushes out, oldest first.
     fn push(&mut self, commit: &str, writer: Option<Arc<str>>, written: Written) -> Vec<Arc<Kept>> {
         let mut world = self.root().clone();
         let was = |key: &FactKey| world.fact(key).map_or_else(|| size::of_key(key), |fact| size::of_fact(key, fact));
@@ -386,7 +386,7 @@ impl History {
             let (key, fact) = fact.into_fact(names);
             (key, Some(fact))
         }));
-        // Before records named writers, only facts did.
+        // Older records have no writer of the commit; it is taken from their facts.
         let of_facts = || written.values().flatten().next()?.writer.clone();
         let writer = writer.map_or_else(of_facts, |name| (!name.is_empty()).then(|| names.share(name)));
         self.push(&commit.id, writer, written);
@@ -421,7 +421,7 @@ impl Journaled for History {
 }
 
 impl Kept {
-    /// What makes the revision before into this one.
+    /// The changes from the revision before to this one.
     pub(super) fn changes(&self) -> impl Iterator<Item = Change> {
         self.written.iter().map(|(key, fact)| match fact {
             Some(fact) => Change::Set { fact: key.as_ref().clone(), value: fact.value.clone() },
@@ -429,7 +429,7 @@ impl Kept {
         })
     }
 
-    /// As it was written down; its fingerprint is among what is remembered, if it still is.
+    /// The record of the revision, without its fingerprint: that one is kept with the remembered commits.
     fn record(&self) -> CommitRecord {
         let gone = self.written.iter().filter(|(_, fact)| fact.is_none());
         CommitRecord {
@@ -483,7 +483,7 @@ mod tests {
         Commit { by, id: id.to_owned(), changes: changes.to_vec(), ..Commit::default() }
     }
 
-    /// What the log of a pool holds.
+    /// The contents of a pool's log.
     #[derive(Default)]
     struct Kept {
         entries: Vec<Vec<u8>>,
@@ -500,7 +500,7 @@ mod tests {
         }
     }
 
-    /// By looking at every fact.
+    /// Compares every fact.
     fn difference(before: &World, after: &World) -> Vec<Difference> {
         let keys: BTreeSet<&FactKey> = before.iter().chain(after.iter()).map(|(key, _)| key).collect();
         let fact = |world: &World, key| world.fact(key).map(|fact| Arc::new(fact.clone()));
@@ -589,11 +589,11 @@ mod tests {
         assert_eq!(history.revisions.len(), 4, "three values of before, and a little for each");
         history.commit(&commit("small", &[Change::Set { fact: key(1), value: Value::Null }]), None).unwrap();
         assert_eq!(history.revisions.len(), 4, "what was replaced counts, not what replaces it");
-        // And so it is after a restart.
+        // The same holds after a restart.
         kept.entries.extend(history.take_entry());
         let again = History::restore(kept.recovered(), &config).unwrap();
         assert_eq!((again.revisions.len(), again.bytes), (history.revisions.len(), history.bytes));
-        // What does not fit at all is made all the same.
+        // A revision that is larger than the limit is made all the same.
         let none = WorldPoolConfig { revision_bytes: 0, ..WorldPoolConfig::default() };
         let mut history = History::new(&none);
         for n in 0..3 {
@@ -609,7 +609,7 @@ mod tests {
         history.commit(&commit_as("a", "r", &changes), None).unwrap();
         let entry = history.take_entry().unwrap();
         let snapshot = history.snapshot()().to_vec();
-        // An earlier version ends where the lists of callers and writers would begin.
+        // In an earlier version the record ends before the lists of callers and writers.
         let earlier = |bytes: &[u8]| [&[2], &bytes.strip_suffix(&[1, 1, b'a', 1, 0]).unwrap()[1..]].concat();
         let of_entry = |entry: Vec<u8>| Kept { entries: vec![entry], snapshot: None };
         let of_snapshot = |bytes: Vec<u8>| Kept { entries: Vec::new(), snapshot: Some(bytes) };
@@ -649,7 +649,7 @@ mod tests {
         for kept in [of_entry(entry.clone()), of_snapshot(snapshot.clone())] {
             assert_eq!(writers(&History::restore(kept.recovered(), &config()).unwrap()), made);
         }
-        // Version 3 ends where the list of writers would begin: only facts said whose they were.
+        // In version 3 the record ends before the list of writers: only facts name their writer.
         let earlier = |bytes: &[u8]| [&[3], &bytes.strip_suffix(&[3, 1, b'n', 1, b'm', 0]).unwrap()[1..]].concat();
         for kept in [of_entry(earlier(&entry)), of_snapshot(earlier(&snapshot))] {
             let again = History::restore(kept.recovered(), &config()).unwrap();

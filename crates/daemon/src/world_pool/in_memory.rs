@@ -1,8 +1,9 @@
-//! What projections hold in memory: what each has of its own, and the facts that the root and the kept revisions do not have any more.
+//! Memory of projections: what each has of its own, and the facts that the root and the kept revisions no longer have.
 //!
-//! A projection shares all that it does not change with its base. So it has no facts of its own but those that it writes, until a
-//! revision is forgotten: then what the next revision replaced is there for projections of older bases alone, and is counted for the youngest
-//! of these, once. When the last projection of a base ends, that goes to the base before which has it, too, or is gone.
+//! A projection shares everything that it does not change with its base. So it has no facts of its own except those that it writes, until a
+//! revision is forgotten: then the facts that the next revision replaced exist for projections of older bases alone. They are counted once,
+//! for the youngest of these bases. When the last projection of a base ends, the facts are counted for the base before if that one has them,
+//! too; otherwise they are freed.
 //!
 //! ```text
 //!   kept revisions            7 ── 8 ── 9 (root)
@@ -10,7 +11,7 @@
 //!               │         └ base of a projection: has what 6 and 7 replaced and was written up to 5
 //!               └ base of a projection: has what 4 and 5 replaced, too, and was written up to 3
 //! ```
-//! A fact is replaced once, so counting costs what is written, and nothing while every base is kept.
+//! A fact is replaced once, so counting costs as much as writing, and nothing while every base is kept.
 
 use super::history::Kept;
 use super::size;
@@ -18,7 +19,7 @@ use ratn_model::id::Revision;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// How many bytes projections may have.
+/// Maximum bytes of projections.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Most {
     pub(super) in_all: usize,
@@ -26,7 +27,7 @@ pub(super) struct Most {
 }
 
 impl Most {
-    /// Without what is kept for operators.
+    /// Without the part that is kept for operators.
     pub(super) fn for_all(self) -> usize {
         self.in_all - self.in_all / OPERATORS_PART
     }
@@ -37,9 +38,9 @@ impl Most {
 pub(super) struct InMemory {
     callers: BTreeMap<Arc<str>, OfCaller>,
     bases: BTreeMap<Revision, Base>,
-    /// What all projections have of their own.
+    /// Bytes of their own of all projections.
     own: usize,
-    /// What forgotten revisions have left to them.
+    /// Bytes of facts of forgotten revisions.
     left: usize,
 }
 
@@ -47,14 +48,14 @@ pub(super) struct InMemory {
 struct OfCaller {
     projections: usize,
     own: usize,
-    /// How many projections it has of each base.
+    /// Number of its projections by base.
     bases: BTreeMap<Revision, usize>,
 }
 
 #[derive(Debug, Default)]
 struct Base {
     projections: usize,
-    /// Bytes of facts that are counted for it, by the revision that wrote them.
+    /// Bytes of facts that are counted for this base, by the revision that wrote them.
     left: BTreeMap<Revision, usize>,
 }
 
@@ -66,16 +67,16 @@ pub(super) enum NoRoom {
     ForOperators,
 }
 
-/// This part of all bytes only operators have.
+/// Operators have one part in this many of all bytes for themselves.
 const OPERATORS_PART: usize = 4;
 
 impl InMemory {
-    /// How many projections a caller has.
+    /// Number of projections of a caller.
     pub(super) fn projections(&self, caller: &str) -> usize {
         self.callers.get(caller).map_or(0, |of| of.projections)
     }
 
-    /// Whether there is room for one of so many bytes.
+    /// Whether there is room for a projection of `own` bytes.
     pub(super) fn check(&self, caller: &str, is_operator: bool, own: usize, most: Most) -> Result<(), NoRoom> {
         let there = self.own + self.left + own;
         if there > most.in_all {
@@ -90,15 +91,15 @@ impl InMemory {
         if there > most.for_all() { Err(NoRoom::ForOperators) } else { Ok(()) }
     }
 
-    /// What a caller's projections have; what is left to a base that others have, too, counts for each of them.
+    /// Bytes of a caller's projections; facts of forgotten revisions count in full for each caller of their base.
     fn of(&self, caller: &str) -> usize {
         let Some(of) = self.callers.get(caller) else { return 0 };
-        // Mostly nothing is left to any.
+        // Usually no base has any.
         let bases = of.bases.keys().take(if self.left == 0 { 0 } else { usize::MAX });
         of.own + bases.filter_map(|base| self.bases.get(base)).flat_map(|base| base.left.values()).sum::<usize>()
     }
 
-    /// One more.
+    /// Adds a projection.
     pub(super) fn begin(&mut self, caller: &Arc<str>, base: Revision, own: usize) {
         let of = self.callers.entry(caller.clone()).or_default();
         of.projections += 1;
@@ -108,7 +109,7 @@ impl InMemory {
         self.bases.entry(base).or_default().projections += 1;
     }
 
-    /// One fewer.
+    /// Removes a projection.
     pub(super) fn end(&mut self, caller: &str, base: Revision, own: usize) {
         if let Some(of) = self.callers.get_mut(caller) {
             of.projections -= 1;
@@ -139,7 +140,7 @@ impl InMemory {
         }
     }
 
-    /// A revision is not kept any more, and `next` is the one behind it.
+    /// A revision was dropped; `next` is its successor.
     pub(super) fn forgotten(&mut self, revision: &Kept, next: &Kept) {
         let Some((base, of)) = self.bases.range_mut(..=revision.world.revision()).next_back() else { return };
         for key in next.written.keys() {
@@ -156,7 +157,7 @@ impl InMemory {
         self.callers.is_empty() && self.bases.is_empty() && self.own == 0 && self.left == 0
     }
 
-    /// All bytes of all projections.
+    /// Bytes of all projections.
     #[cfg(test)]
     pub(super) fn bytes(&self) -> usize {
         self.own + self.left

@@ -1,4 +1,4 @@
-//! Leases that live, as the resource manager's watch reports them. A projection lives as long as its lease.
+//! Live leases, as the resource manager's watch reports them. A projection lives as long as its lease.
 
 use crate::link::Manager;
 use ratn_model::id::LeaseId;
@@ -9,24 +9,24 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 use tokio::sync::watch;
 
-/// The pause before the manager is watched again.
+/// Pause before a broken watch is opened again.
 const RETRY_INTERVAL: Duration = Duration::from_millis(50);
 
-/// The live leases, by what they hold.
+/// The live leases, with their resources.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct LiveLeases {
     held: BTreeMap<LeaseId, Held>,
-    /// The youngest that was ever told of: ids grow, so an older one that does not live has ended.
+    /// The youngest lease ever reported: ids grow, so an older lease that is not live has ended.
     youngest: LeaseId,
-    /// Counts snapshots: each tells anew what lives.
+    /// Number of snapshots so far: each replaces all leases.
     pub(super) snapshots: u64,
 }
 
-/// What a live lease holds.
+/// The resources of a live lease.
 #[derive(Debug, Clone, Default, PartialEq)]
 struct Held {
     resources: BTreeSet<String>,
-    /// Who opened its session, as the resource manager's connection proved; empty where nobody knows.
+    /// Who opened its session, as authenticated by the resource manager; empty where that is unknown.
     opened_by: String,
 }
 
@@ -38,7 +38,7 @@ pub(super) enum Known<'a> {
         opened_by: &'a str,
     },
     Ended,
-    /// Too young: the watch has not told of it yet.
+    /// The lease is younger than any that the watch has reported.
     NotYet,
 }
 
@@ -73,7 +73,7 @@ impl LiveLeases {
         self.youngest = self.youngest.max(lease);
     }
 
-    /// Whether anything is known that was not before.
+    /// Returns whether the update changed anything.
     fn update(&mut self, update: &ResourceUpdate) -> bool {
         let event = match update {
             ResourceUpdate::Snapshot { resources, youngest, .. } => {
@@ -99,7 +99,7 @@ impl LiveLeases {
     }
 }
 
-/// Keeps `live` up to date for ever.
+/// Keeps `live` up to date. Never returns.
 pub(super) async fn follow(manager: Manager, live: watch::Sender<LiveLeases>) {
     let channels = Channels::new(&manager.tls);
     loop {
@@ -140,7 +140,7 @@ mod tests {
     use ratn_model::resource::{Quantity, ResourceClass};
     use ratn_proto::types::{Holding, ResourceEvent};
 
-    /// Everything is held by a session that adam opened.
+    /// `adam` opened the session of every lease.
     const ADAMS: Known<'_> = Known::Lives { opened_by: "adam" };
 
     fn event(kind: ResourceEventKind, resource: &str, lease: u64) -> ResourceUpdate {

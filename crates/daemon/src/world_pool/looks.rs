@@ -1,13 +1,13 @@
-//! What the changes of a call have the pool look at: a deletion by a pattern looks at every fact that the index does not tell from those that it is
-//! about, and at every earlier change of the call. All others wait meanwhile, so there is a bound.
+//! Bounds the work of a call's changes. A deletion by pattern looks at every fact that the index cannot exclude, and at every earlier change of the
+//! call. All other calls wait meanwhile.
 
 use ratn_model::fact::Change;
 use ratn_world::world::World;
 
-/// At so many facts and changes the changes of a call may have the pool look; a tenth of a second or so.
+/// Maximum number of facts and changes that the changes of a call may look at; about a tenth of a second.
 const MOST: usize = 1_000_000;
 
-/// The changes of a call would have the pool look at too much.
+/// The changes of a call would look at too many facts.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "the deletions by patterns (`?`) of these changes would look at more than {MOST} facts and changes: delete facts by their whole names, or in \
@@ -15,7 +15,7 @@ const MOST: usize = 1_000_000;
 )]
 pub(super) struct TooManyLooks;
 
-/// Whether changes of this world stay within the bound.
+/// Whether the changes stay within the bound in this world.
 pub(super) fn check(world: &World, changes: &[Change]) -> Result<(), TooManyLooks> {
     let mut left = MOST;
     for (earlier, change) in changes.iter().enumerate() {
@@ -46,7 +46,7 @@ mod tests {
         FactKey { predicate: "p".to_owned(), arguments: [n, 7, n].map(Term::Int).to_vec() }
     }
 
-    /// Of facts that there are none of, among those that the index finds by the second argument.
+    /// A deletion of facts that do not exist, among those that the index finds by the second argument.
     fn deletion(n: i64) -> Change {
         let arguments = vec![None, Some(Term::Int(7)), Some(Term::Int(-n))];
         Change::Delete { pattern: FactPattern { predicate: "p".to_owned(), arguments } }
@@ -60,7 +60,7 @@ mod tests {
         assert_eq!(check(&world, &deletions(600)), Err(TooManyLooks));
         let by_name = |n| Change::Delete { pattern: FactPattern::of(&key(n)) };
         assert_eq!(check(&world, &(1..=20_000).map(by_name).collect::<Vec<_>>()), Ok(()));
-        // What the same call has written is looked at, too.
+        // Facts that the same call has written are looked at, too.
         let written = (1..=20_000).map(|n| Change::Set { fact: key(n), value: Value::Null });
         let changes: Vec<Change> = written.chain(deletions(100)).collect();
         assert_eq!(check(&World::from_facts([], Revision(1)), &changes), Err(TooManyLooks));

@@ -1,14 +1,14 @@
 //! Remembered answers, by caller and request id: a request that the same caller repeats under the same id is performed once.
 //!
-//! Bounded in all and for each caller. A caller's own oldest answers are forgotten first; where all callers together have too many, those of
-//! the caller with the most.
+//! Bounded in all and for each caller. A caller's own oldest answers are forgotten first; where all callers together have too many, the
+//! oldest of the caller with the most is forgotten.
 
 use super::fingerprint::Fingerprint;
 use crate::access::Caller;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// How many answers are remembered.
+/// Maximum numbers of remembered answers.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Bounds {
     pub(super) in_all: usize,
@@ -19,15 +19,15 @@ pub(super) struct Bounds {
 #[derive(Debug, Clone)]
 pub(super) struct Memory<T> {
     answers: BTreeMap<Key, Answer<T>>,
-    /// Of all callers, the oldest first.
+    /// Answers of all callers, oldest first.
     order: BTreeMap<u64, Key>,
-    /// The numbers of each caller's answers in that order.
+    /// The sequence numbers of each caller's answers.
     of_callers: BTreeMap<Arc<str>, BTreeMap<u64, Arc<str>>>,
     next: u64,
     bounds: Bounds,
 }
 
-/// The id comes first, so that the answers of one id stand together.
+/// The id comes first, so that all answers of one id are adjacent.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 struct Key {
     id: Arc<str>,
@@ -40,7 +40,7 @@ struct Answer<T> {
     value: T,
 }
 
-/// An id that was used for something else before.
+/// An id that was used for another request before.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("request id `{id}` was used for another request before; ids are unique to what is asked")]
 pub(super) struct Reused {
@@ -53,7 +53,8 @@ impl<T: Copy> Memory<T> {
         Memory { answers, order, of_callers, next: 0, bounds }
     }
 
-    /// What this request led to before; an empty id is never known. An answer to nobody knows whom is that of whoever asks the same.
+    /// The first answer to this request; an empty id is never known. An answer whose caller is unknown belongs to everybody who asks the
+    /// same.
     pub(super) fn recall(&self, caller: &Arc<str>, id: &str, fingerprint: Fingerprint) -> Result<Option<T>, Reused> {
         let key = Key { id: Arc::from(id), caller: caller.clone() };
         if let Some(own) = self.answers.get(&key) {
@@ -64,12 +65,12 @@ impl<T: Copy> Memory<T> {
         Ok(unknown.filter(|answer| answer.fingerprint.may_be(fingerprint)).map(|answer| answer.value))
     }
 
-    /// The answer to a request of this caller, whatever it asked for.
+    /// The answer to a request of this caller, whatever the request was.
     pub(super) fn of(&self, caller: &Arc<str>, id: &str) -> Option<T> {
         self.answers.get(&Key { id: Arc::from(id), caller: caller.clone() }).map(|answer| answer.value)
     }
 
-    /// As [`Memory::recall`]. An operator may go on with what another caller began: the same request of anybody is the operator's.
+    /// As [`Memory::recall`]. An operator may continue what another caller began: the same request of any caller counts as the operator's.
     pub(super) fn recall_for(&self, caller: &Caller, id: &str, fingerprint: Fingerprint) -> Result<Option<T>, Reused> {
         let own = self.recall(&caller.name, id, fingerprint)?;
         if own.is_some() || !caller.is_operator() {
@@ -112,7 +113,7 @@ impl<T: Copy> Memory<T> {
         }
     }
 
-    /// The answers with whom they were given to, the oldest first.
+    /// The answers with their callers, oldest first.
     pub(super) fn iter(&self) -> impl Iterator<Item = (&Arc<str>, &Arc<str>, Fingerprint, T)> {
         self.order.values().filter_map(|key| {
             let answer = self.answers.get(key)?;
@@ -128,7 +129,7 @@ mod tests {
     use crate::access::Role;
     use ratn_proto::v1;
 
-    /// Of requests that ask for different things.
+    /// The fingerprint of request number `n`.
     fn print(n: u64) -> Fingerprint {
         Fingerprint::of("test", &v1::CommitRequest { revision: n, ..v1::CommitRequest::default() })
     }

@@ -5,7 +5,7 @@
 //!   gRPC call ──▶ service.rs ──message──▶ actor.rs (core.rs) ◀──leases that live── leases.rs ◀──watch── resource manager
 //!   core.rs (history.rs) ──commits──▶ journal (ratn-storage) ──durable──▶ outbox ──▶ what tells of them leaves
 //! ```
-//! After a restart the root, its revisions and the commit ids are as they were when the last answer left; projections have ended.
+//! After a restart the root, its revisions and the commit ids are as they were when the last answer was sent; projections have ended.
 //! Which effects are projected, and when they become real, is task control's business.
 
 mod actor;
@@ -53,13 +53,13 @@ use std::time::Duration;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-/// The role's name: of its endpoint file, its command and its section of a config.
+/// The name of the role: in its endpoint file, its command and its section of a config.
 pub const ROLE: &str = "world-pool";
 
 /// Serves until `shutdown` is cancelled.
 ///
 /// # Errors
-/// Where its state cannot be had, where it cannot listen or publish its endpoint, or where serving fails.
+/// Where its state cannot be loaded, where it cannot listen or publish its endpoint, or where serving fails.
 pub async fn run(
     config: WorldPoolConfig,
     directory: RuntimeDirectory,
@@ -68,7 +68,7 @@ pub async fn run(
     run_as(config, directory, Serving::default(), Arc::new(Metrics::new(ROLE)), ClientTls::none(), shutdown).await
 }
 
-/// As [`run`], served and counted as its host wants it; `tls` is what it trusts and shows as a client.
+/// As [`run`], with `serving` and `metrics` of its host; `tls` is what the pool trusts and shows as a client.
 ///
 /// # Errors
 /// As [`run`].
@@ -107,7 +107,7 @@ pub async fn run_as(
         lifecycle: None,
         demand: None,
     };
-    // Calls under way need all of it until the last has ended.
+    // These parts run until the last call in progress has ended.
     let over = CancellationToken::new();
     let _over = over.clone().drop_guard();
     let linked = tokio::spawn(exit_on_panic(LINK, link.keep(over.clone())));
@@ -130,15 +130,15 @@ pub async fn run_as(
     tracing::info!(%endpoint, "{ROLE} is ready");
     let served = standby::serve(bound, Services::new().with(service), serving, shutdown, &over).await;
     drop(published);
-    // What was still to be written is on the disk when this has ended.
+    // When this has ended, all pending records are on the disk.
     over.cancel();
     let _ = ended.await;
     let _ = linked.await;
     Ok(served?)
 }
 
-/// Takes the place of the one writer, and restores the history. Without durability, and where an older state was put in place, somebody
-/// may have heard of revisions that are lost.
+/// Becomes the one writer, and restores the history. Without durability, and where an older state was restored, clients may have heard
+/// of revisions that are lost.
 fn open(config: &WorldPoolConfig, store: Arc<dyn Store>) -> Result<(History, Journal), JournalError> {
     let restore = |recovered| History::restore(recovered, config);
     let (history, journal) = Journal::open(ROLE, &config.storage, store, restore)?;
@@ -153,7 +153,7 @@ fn ontology(file: &Path) -> anyhow::Result<Ontology> {
         .with_context(|| format!("cannot read the ontology {place}"))?;
     let beside = |using: &str, path: &str| {
         let other = Path::new(using).parent().unwrap_or(Path::new("")).join(path);
-        // By its own name it is known again.
+        // The canonical name, so that a file that is imported twice is recognized.
         let other = other.canonicalize().map_err(|error| error.to_string())?;
         let text = ratn_regular_file::read_text(&other, ratn_regular_file::USUAL).map_err(|error| error.to_string())?;
         Ok((other.display().to_string(), text))

@@ -1,29 +1,29 @@
-//! Messages that came before what they are about: each waits a moment for that.
+//! Messages that came before the projection or commit that they need: each waits a moment for it.
 
 use ratn_model::time::Timestamp;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// So long a message waits.
+/// How long a message waits.
 pub(super) const PATIENCE: Duration = Duration::from_secs(1);
 
-/// So many wait at the most.
+/// Maximum number of waiting messages.
 pub(super) const MOST: usize = 4_096;
 
-/// Of these, so many of one caller: who asks in vain leaves room for the others.
+/// Part of these for one caller: a caller who waits in vain leaves room for the others.
 pub(super) const MOST_OF_ONE: usize = 2_048;
 
-/// What those that wait take in memory at the most, about, and those of one caller.
+/// Approximate maximum memory of waiting messages in bytes, in all and of one caller.
 const MOST_BYTES: usize = 256 << 20;
 const MOST_BYTES_OF_ONE: usize = MOST_BYTES / 2;
 
-/// The messages that wait, the oldest first, each with the end of its patience.
+/// The waiting messages, oldest first, each with its deadline.
 #[derive(Debug)]
 pub(super) struct Parked<M> {
     messages: VecDeque<One<M>>,
     bytes: usize,
-    /// What of each caller waits.
+    /// Waiting messages of each caller.
     of: BTreeMap<Arc<str>, Waiting>,
 }
 
@@ -48,7 +48,7 @@ impl<M> Default for Parked<M> {
 }
 
 impl<M> Parked<M> {
-    /// Has a message of a caller wait, which has so many bytes; gives it back where as many wait already as may, in all or of that caller.
+    /// Lets a message of a caller wait, which takes this many bytes; returns it where too many wait already, in all or of that caller.
     pub(super) fn park(&mut self, now: Timestamp, whose: Arc<str>, bytes: usize, message: M) -> Result<(), M> {
         let Waiting { messages: of_caller, bytes: bytes_of_caller } = self.of.get(&whose).copied().unwrap_or_default();
         let too_many = self.messages.len() >= MOST || of_caller >= MOST_OF_ONE;
@@ -61,12 +61,12 @@ impl<M> Parked<M> {
         Ok(())
     }
 
-    /// When the first has waited long enough.
+    /// When the first message has waited long enough.
     pub(super) fn next_deadline(&self) -> Option<Timestamp> {
         self.messages.front().map(|one| one.until)
     }
 
-    /// Those that need not wait any more, or have waited long enough, in the order in which they came.
+    /// Takes the messages that need not wait any more, or have waited long enough, in the order of arrival.
     pub(super) fn take(&mut self, now: Timestamp, is_early: impl Fn(&M) -> bool) -> Vec<M> {
         if self.messages.is_empty() {
             return Vec::new();
@@ -128,7 +128,7 @@ mod tests {
         assert_eq!(one(&mut parked, start, "eve", 9_999), Err(9_999));
         assert!((MOST_OF_ONE..MOST).all(|message| one(&mut parked, start, "adam", message).is_ok()));
         assert_eq!(one(&mut parked, start, "cain", 9_999), Err(9_999));
-        // What was answered makes room for its own caller.
+        // An answered message makes room for its own caller.
         assert_eq!(parked.take(start, |message| *message != 7), [7]);
         assert_eq!(one(&mut parked, start, "adam", 9_998), Err(9_998));
         assert_eq!(one(&mut parked, start, "eve", 9_998), Ok(()));

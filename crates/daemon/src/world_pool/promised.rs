@@ -1,7 +1,7 @@
-//! Ids of projections that were promised to a caller, who names them to others before the projections are there.
+//! Ids of projections that were promised to a caller, who can pass them on before the projections exist.
 //!
-//! Nobody else makes a projection with such an id. A promise ends after a while. Bounded: of one caller's the oldest are forgotten, and where
-//! all callers together have too many nothing more is promised.
+//! Nobody else can make a projection with such an id. A promise ends after a while. Bounded: a caller with too many loses its oldest, and
+//! where all callers together have too many nothing more is promised.
 
 use ratn_model::id::ProjectionId;
 use ratn_model::time::Timestamp;
@@ -9,26 +9,26 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// An answer promises at most so many.
+/// Maximum number of ids promised in one answer.
 pub(super) const MOST_AT_ONCE: u32 = 64;
-/// A caller has at most so many that are not used yet; several runs may be one caller's.
+/// Maximum number of unused ids of a caller; several runs may belong to one caller.
 const MOST_PER_CALLER: usize = 16_384;
-/// All callers together.
+/// Maximum number of unused ids of all callers together.
 const MOST: usize = 65_536;
 
-/// So long a promise is kept.
+/// How long a promise is kept.
 const KEPT: Duration = Duration::from_secs(30);
 
 /// See the module.
 #[derive(Debug, Default)]
 pub(super) struct Promised {
-    /// Whose each is, and when it ends.
+    /// The caller of each id, and when the promise ends.
     to: BTreeMap<ProjectionId, (Arc<str>, Timestamp)>,
     of: BTreeMap<Arc<str>, BTreeSet<ProjectionId>>,
 }
 
 impl Promised {
-    /// How many of `wanted` ids can be promised now.
+    /// Number of ids that can be promised now, at most `wanted`.
     pub(super) fn room(&self, wanted: u32) -> u32 {
         let left = u32::try_from(MOST - self.to.len()).unwrap_or(u32::MAX);
         wanted.min(MOST_AT_ONCE).min(left)
@@ -46,17 +46,17 @@ impl Promised {
         }
     }
 
-    /// Whether it was promised, and no projection has it yet.
+    /// Whether the id is promised and no projection has it yet.
     pub(super) fn has(&self, id: ProjectionId) -> bool {
         self.to.contains_key(&id)
     }
 
-    /// To whom it was promised.
+    /// The caller to whom the id was promised.
     pub(super) fn whose(&self, id: ProjectionId) -> Option<&Arc<str>> {
         self.to.get(&id).map(|(caller, _)| caller)
     }
 
-    /// Ends those that were kept long enough. Ids grow, so the first is the oldest.
+    /// Ends the promises that were kept long enough. Ids grow, so the first is the oldest.
     pub(super) fn expire(&mut self, now: Timestamp) {
         while let Some((id, (_, until))) = self.to.first_key_value()
             && *until <= now
@@ -65,7 +65,7 @@ impl Promised {
         }
     }
 
-    /// It is used, or taken back.
+    /// Ends the promise: the id is used or taken back.
     pub(super) fn end(&mut self, id: ProjectionId) {
         if let Some((caller, _)) = self.to.remove(&id)
             && let Some(own) = self.of.get_mut(&caller)

@@ -1,30 +1,30 @@
-//! A query of one world: what it shows, found away from the actor's thread.
+//! A query of one world, evaluated outside the actor's thread.
 //!
-//! The actor only says which world is asked, and what of it is shown; worlds share what they have in common, so that costs nothing. The
-//! facts are looked for by the call itself: in order, from where a page begins to where it is full. However much there is, commits and
-//! projections of others do not wait for it.
+//! The actor only determines the world and its visible part; worlds share their common data, so that costs nothing. The call itself
+//! searches the facts, in order, from the beginning of a page until it is full. So commits and projections of other callers do not
+//! wait, however large the world is.
 //!
-//! A query that goes through the world once is answered, whatever the size of that. Several patterns may look at a fact many
-//! times, and are refused where they do so more than [`MORE`] times.
+//! A query that goes through the world once is answered, whatever the size of the world. Several patterns may look at a fact many
+//! times; the query is refused where that takes more than [`MORE`] further looks.
 
 use ratn_model::fact::{FactKey, FactPattern, Footprint};
 use ratn_model::id::Revision;
 pub(super) use ratn_world::search::Found;
 use ratn_world::world::{Fact, World};
 
-/// Looks at facts, beyond one at each fact of the world.
+/// Allowed looks at facts, beyond one look at each fact of the world.
 pub(super) const MORE: usize = 2_000_000;
 
-/// What is asked.
+/// The world that a query asks, and the visible part.
 #[derive(Debug, Clone)]
 pub(super) struct View {
     pub(super) world: World,
-    /// Of the root, or of the root below the projection.
+    /// The revision of the root, or of the projection's base.
     pub(super) revision: Revision,
     pub(super) shown: Footprint,
 }
 
-/// A query that looks at more than it may.
+/// The query would look at too many facts.
 #[derive(Debug, thiserror::Error)]
 #[error(
     "the query looks at more than {most} facts: as many as there are, and {MORE} more; ask with fewer patterns, or name the subject or \
@@ -35,18 +35,18 @@ pub(super) struct TooMuch {
 }
 
 impl View {
-    /// How many facts a query may look at.
+    /// Maximum number of facts that a query may look at.
     pub(super) fn most(&self) -> usize {
         self.world.len().saturating_add(MORE)
     }
 
-    /// Why it is not answered where it would look at more.
+    /// The refusal of a query that would look at more.
     pub(super) fn too_much(&self) -> TooMuch {
         TooMuch { most: self.most() }
     }
 
-    /// Visits the facts that match any of the patterns, in the order of keys, each once, until told to stop; without a pattern all that
-    /// is shown. No more than `most` facts are looked at, those that do not match included; without a pattern all are.
+    /// Visits the facts that match any of the patterns, each once, in the order of keys, until `visit` says stop; without a pattern all
+    /// visible facts. At most `most` facts are looked at, those that do not match included; without a pattern there is no limit.
     pub(super) fn find(
         &self,
         patterns: &[FactPattern],

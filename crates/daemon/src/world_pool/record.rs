@@ -1,7 +1,7 @@
-//! The root's history as bytes: entries of the log, and the snapshot that stands for them.
+//! The root's history as bytes: entries of the log, and the snapshot that replaces them.
 //!
-//! A commit is written down as what it came to (which facts hold which values, which are gone), never as what was asked: nothing is
-//! computed again when it is read.
+//! A commit is recorded as its result (which facts have which values, which are deleted), never as the request: nothing is computed
+//! again when it is read.
 
 use super::fingerprint::Fingerprint;
 use ratn_model::fact::{FactKey, FactPattern, Term};
@@ -14,52 +14,52 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// The version that is written, the first byte. Only variants of enums are ever added to one, at their end; whatever else changes takes
-/// a new number, and the older ones are still read.
+/// The version that is written, as the first byte. Enums may only get new variants at their end; every other change needs a new number,
+/// and older versions are still read.
 const FORMAT: u8 = 4;
-/// The last version that does not say whose a commit is that only deletes.
+/// The last version that does not name the writer of a commit that only deletes.
 const WITHOUT_WRITERS: u8 = 3;
-/// The last version that does not say who committed.
+/// The last version that does not name the callers of commits.
 const WITHOUT_CALLERS: u8 = 2;
-/// The fingerprints are of the debug text of changes, which says nothing to a later version.
+/// In this version fingerprints are of the debug text of changes, which later versions cannot compare.
 const DEBUG_FINGERPRINTS: u8 = 1;
-/// What its bytes are, in messages.
+/// What the bytes are, for error messages.
 const RECORDS: &str = "records of a world pool";
 
-/// One commit. Without an id and without changes: the revisions before it are lost, and go on from it.
+/// One commit. Without an id and without changes it is a leap: the revisions before it are lost, and numbering continues from it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct CommitRecord {
     pub(super) revision: u64,
     pub(super) id: String,
     pub(super) fingerprint: Fingerprint,
-    /// What matches is gone, unless it is among the facts below.
+    /// Matching facts are deleted, unless they are among the facts below.
     pub(super) deleted: Vec<PatternRecord>,
     pub(super) written: Vec<FactRecord>,
 }
 
-/// The commits of one entry, and who asked for each, in the same order; nobody knows where they are not there.
+/// The commits of one entry, and the caller of each in the same order; no callers where they are unknown.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct EntryRecord {
     pub(super) commits: Vec<CommitRecord>,
     pub(super) callers: Vec<Arc<str>>,
-    /// The node that made each, in the same order; empty where nobody said.
+    /// The node that made each, in the same order; empty where unknown.
     pub(super) writers: Vec<Arc<str>>,
 }
 
-/// The oldest revision that is kept, the commits since, and the answers that are remembered, the oldest first.
+/// The oldest kept revision, the commits since, and the remembered answers, oldest first.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct SnapshotRecord {
     pub(super) revision: u64,
     pub(super) facts: Vec<FactRecord>,
     pub(super) commits: Vec<CommitRecord>,
     pub(super) remembered: Vec<(String, Fingerprint, u64)>,
-    /// To whom those answers were given, in the same order; to nobody knows whom where they are not there.
+    /// The callers of the remembered answers, in the same order; missing where they are unknown.
     pub(super) callers: Vec<Arc<str>>,
-    /// The nodes that made `commits`, in the same order; empty where nobody said.
+    /// The nodes that made `commits`, in the same order; empty where unknown.
     pub(super) writers: Vec<Arc<str>>,
 }
 
-/// A fact with who wrote it when.
+/// A fact with its writer and revision.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct FactRecord {
     predicate: String,
@@ -77,7 +77,7 @@ pub(super) struct PatternRecord {
     arguments: Vec<Option<TermRecord>>,
 }
 
-/// An argument; of itself it does not say in its bytes which kind it is.
+/// An argument. The bytes alone do not tell its kind.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 enum TermRecord {
     Int(i64),
@@ -88,10 +88,10 @@ pub(super) fn encode<T: Serialize>(value: &T) -> Vec<u8> {
     versioned::encode(FORMAT, value)
 }
 
-/// A record of this version or an earlier one, and which: each is the one before with one more list at its end.
+/// Decodes a record of this version or an earlier one, and returns the version: each version appends one more list to the one before.
 fn decode<T: for<'a> Deserialize<'a>>(bytes: &[u8]) -> Result<(T, u8), DecodeError> {
     let version = versioned::version(DEBUG_FINGERPRINTS, FORMAT, RECORDS, bytes)?;
-    // Empty lists, as postcard writes them.
+    // Empty lists, as postcard encodes them.
     let missing: &[u8] = match version {
         ..=WITHOUT_CALLERS => &[0, 0],
         WITHOUT_WRITERS => &[0],
@@ -122,13 +122,13 @@ impl SnapshotRecord {
 }
 
 impl CommitRecord {
-    /// Whether it only says where revisions go on.
+    /// Whether it only sets the revision from which numbering continues.
     pub(super) fn is_leap(&self) -> bool {
         self.id.is_empty() && self.deleted.is_empty() && self.written.is_empty()
     }
 }
 
-/// What a record says of a writer.
+/// The name of a writer in a record; empty without a writer.
 pub(super) fn writer_name(writer: Option<&Arc<str>>) -> Arc<str> {
     writer.cloned().unwrap_or_default()
 }
@@ -145,7 +145,7 @@ impl FactRecord {
         }
     }
 
-    /// The fact; writers of the same name share it.
+    /// The fact; facts of the same writer share its name.
     pub(super) fn into_fact(self, names: &mut Names) -> (Arc<FactKey>, Arc<Fact>) {
         let arguments = self.arguments.into_iter().map(TermRecord::into_term).collect();
         let key = FactKey { predicate: self.predicate, arguments };
@@ -191,7 +191,7 @@ impl TermRecord {
 pub(super) struct Names(BTreeSet<Arc<str>>);
 
 impl Names {
-    /// The name that all who say this one share.
+    /// The shared copy of this name.
     pub(super) fn share(&mut self, name: Arc<str>) -> Arc<str> {
         if let Some(known) = self.0.get(&name) {
             return Arc::clone(known);

@@ -1,8 +1,8 @@
-//! Scenes for planners: each sent as what it differs by from one that the planner has.
+//! Scenes for planners: each is sent as the difference from a scene that the planner has.
 //!
-//! A projection's scene is that of its base with what its effects move, and the base's is that of a revision before it with what was
-//! written since: so a scene costs what it does not share with one that is known. Scenes that were sent are kept for a while, by
-//! digest; a planner with none of them is sent all of it.
+//! A projection's scene is that of its base with the moves of its effects, and the base's scene is that of an earlier revision with the facts
+//! written since. So a scene costs as much as its difference from a known one. Scenes that were sent are kept for a while, by digest; a planner
+//! that has none of them is sent the whole scene.
 
 use super::core::{QueryError, WorldPool};
 use super::history::History;
@@ -14,21 +14,21 @@ use ratn_world::scene::live::LiveScene;
 use ratn_world::world::World;
 use std::collections::{BTreeMap, VecDeque};
 
-/// Scenes that were sent and are kept; they share what they have in common.
+/// Maximum number of sent scenes that are kept; they share their common parts.
 const MAX_SENT: usize = 64;
-/// Revisions whose scenes are kept, to go on from.
+/// Maximum number of revisions whose scenes are kept, to derive later scenes from.
 const MAX_FOLLOWED: usize = 16;
 
 /// The scenes that are kept.
 #[derive(Debug, Default)]
 pub(super) struct Scenes {
-    /// The one sent last comes last.
+    /// The scene that was sent last is at the end.
     sent: VecDeque<(Digest, LiveScene)>,
     followed: BTreeMap<Revision, LiveScene>,
 }
 
 impl WorldPool {
-    /// The scene of a projection, or of the root, from the first of the bases that is kept here, else from nothing.
+    /// The scene of a projection or of the root, as a difference from the first of `bases` that is kept here, else the whole scene.
     pub(super) fn scene(&mut self, id: Option<ProjectionId>, bases: &[Digest]) -> Result<SceneDelta, QueryError> {
         let scene = match id {
             None => {
@@ -52,13 +52,13 @@ impl WorldPool {
 }
 
 impl Scenes {
-    /// Nothing is known of the revisions of another history.
+    /// Forgets the revisions of another history.
     pub(super) fn forget(&mut self) {
         self.followed.clear();
     }
 
-    /// The scene of a revision, from the one before it that is kept. What is between the two is looked at as one change: a revision of which no
-    /// scene can be made spoils none of those behind it.
+    /// The scene of a revision, derived from the latest earlier one that is kept. All changes between the two are applied as one, so a revision
+    /// of which no scene can be made does not affect later ones.
     fn follow(&mut self, history: &History, revision: Revision) -> Result<LiveScene, QueryError> {
         let world = history.at(revision)?;
         let known = self.followed.range(..=revision).next_back();
@@ -94,7 +94,7 @@ impl Scenes {
     }
 }
 
-/// What of the changes moves anything.
+/// The changes that move something in the scene.
 pub(super) fn moves(changes: &[Change]) -> Vec<Change> {
     let is_geometric = |change: &&Change| {
         let pattern = change.pattern();
@@ -112,7 +112,7 @@ fn shows_all(reads: &Footprint) -> bool {
     })
 }
 
-/// What of a world is shown.
+/// The visible part of a world.
 fn shown(world: &World, reads: &Footprint) -> World {
     let Footprint::Patterns(reads) = reads else { return world.clone() };
     let facts = reads.iter().flat_map(|read| world.matching(read));
@@ -134,7 +134,7 @@ mod tests {
     use ratn_proto::v1;
     use ratn_world::scene::{Scene, Shape};
 
-    /// What a planner with a scene of as many objects has to be sent at the most when one of them is elsewhere.
+    /// Maximum bytes sent to a planner that has a scene of this many objects when one of them has moved.
     const OBJECTS: usize = 1_000;
     const MOST_BYTES: usize = 512;
 

@@ -1,4 +1,4 @@
-//! gRPC in front of the actor.
+//! The gRPC service in front of the actor.
 
 use super::actor::{Handle, Message, NewProjection, Update, WATCH_AGAIN_AFTER};
 use super::history::{Commit, Kept};
@@ -32,16 +32,16 @@ use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Request, Response, Status, Streaming};
 
-/// A grant may reach the client before the watch tells of it: so long a projection waits for that.
+/// A grant may reach the client before the watch reports the lease: a projection waits up to this long for it.
 const LEASE_PATIENCE: Duration = Duration::from_secs(1);
 
-/// Scenes that a client may say that it has.
+/// Maximum number of scenes that a client may name as known.
 const MOST_BASES: usize = 16;
 
-/// A query looks at so many facts where it was called; one that takes more goes to a thread of its own.
+/// A query that looks at no more than this many facts runs in the call's own task; a longer one goes to a separate thread.
 const AT_ONCE: usize = 4_096;
 
-/// Of a fact's history.
+/// Maximum number of versions of a fact in an answer.
 const MOST_VERSIONS: usize = 1_000;
 
 /// The service; clones share the actor.
@@ -55,7 +55,7 @@ pub(super) struct Service {
     pub(super) metrics: Arc<Metrics>,
 }
 
-/// What takes long to read is read in threads of its own, a few at a time: the others are for everybody else.
+/// Long reads run in separate threads, a few at a time, which leaves the other threads to everybody else.
 #[derive(Debug, Clone)]
 pub(super) struct LongReads(Arc<Semaphore>);
 
@@ -81,8 +81,8 @@ impl LongReads {
     }
 }
 
-/// A page of the facts that a query finds behind those seen before, and whether there are more; nothing where that would look at more
-/// than `most` facts.
+/// A page of the facts that a query finds after those already seen, and whether there are more; `None` where that would look at more than
+/// `most` facts.
 fn page_of(
     view: &View,
     patterns: &[FactPattern],
@@ -103,15 +103,15 @@ fn page_of(
     Ok((found == Found::All).then_some((filled.items, more)))
 }
 
-/// The changes of a projection are of so many different writers at the most: each is compared with the others.
+/// Maximum number of different writers in the changes of a projection: each is compared with the others.
 const MOST_WRITERS: usize = 4_096;
 
-/// What is accepted at the most, in bytes.
+/// Maximum sizes of requests, in bytes.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sizes {
-    /// Of one change, or one piece of evidence.
+    /// One change, or one piece of evidence.
     pub(super) fact: usize,
-    /// Of all of them together.
+    /// All of them together.
     pub(super) commit: usize,
 }
 
@@ -200,7 +200,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         if let Some(lease) = lease {
             let mut leases = self.leases.clone();
             let told = leases.wait_for(|leases| leases.known(lease) != Known::NotYet);
-            // In vain for one that was never given: the actor refuses that.
+            // For a lease that does not exist this waits in vain, and the actor refuses the request.
             let _ = tokio::time::timeout(LEASE_PATIENCE, told).await;
         }
         let promise = request.promise;
@@ -220,7 +220,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let place = paging::place(&request.page_token, &same)?;
         let page = Page::of(request.page_bytes, &request.page_token);
         let at = match place {
-            // The next page is of the same revision; a projection has only one.
+            // The next page is of the same revision; a projection has only one revision.
             Some((revision, _)) => Some(Revision(revision)).filter(|_| projection.is_none()),
             None => request.at_revision.map(Revision),
         };
@@ -230,7 +230,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let asked = patterns.clone();
         let view = self.actor.request(|answer| Message::Query { by, projection, at, patterns: asked, answer }).await?;
         let (revision, seen) = (view.revision, place.map_or(0, |(_, seen)| seen));
-        // Without a pattern a query looks at all that there is.
+        // Without a pattern a query looks at all facts.
         let few = !patterns.is_empty() || view.world.len() <= AT_ONCE;
         let at_once = if few { page_of(&view, &patterns, seen, page, AT_ONCE)? } else { None };
         let (facts, more) = match at_once {
@@ -362,7 +362,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
     }
 }
 
-/// What a watch ends with that did not end by itself.
+/// The final status of a watch that was cut off.
 fn cut_off() -> Status {
     let message = "the watch has ended, for it was too slow or the disk failed: watch again";
     retry_later(Code::Unavailable, "WATCH_AGAIN", message, WATCH_AGAIN_AFTER)
@@ -370,8 +370,8 @@ fn cut_off() -> Status {
 
 type Messages = Box<dyn Iterator<Item = Result<v1::WorldPoolServiceWatchResponse, Status>> + Send>;
 
-/// What of an update a watcher of these patterns is told, each message made when it is wanted. Where the history keeps a revision no more that
-/// it has still to tell of, the watcher was too slow.
+/// The messages of an update for a watcher with these patterns, each made when it is needed. A watcher that still needs a revision which the
+/// history has dropped was too slow.
 fn messages(update: Update, patterns: Arc<[FactPattern]>, in_parts: bool) -> Messages {
     match update {
         Update::Snapshot(root) => Box::new(snapshot(root, patterns, in_parts)),
@@ -382,7 +382,7 @@ fn messages(update: Update, patterns: Arc<[FactPattern]>, in_parts: bool) -> Mes
     }
 }
 
-/// What holds, in messages that are not too large.
+/// The current facts, in messages that are not too large.
 fn snapshot(
     root: Weak<Kept>,
     patterns: Arc<[FactPattern]>,
@@ -403,7 +403,7 @@ fn snapshot(
         });
         let more = page.fill(facts, part)?;
         let last = before.cloned();
-        // The last one that was looked at had no room.
+        // The last fact had no room on this page.
         behind = if more { last } else { None };
         Ok(more)
     });
@@ -415,7 +415,8 @@ fn snapshot(
     })
 }
 
-/// A revision, where some of it is wanted; one that is too large for a message as that, so that the client begins anew.
+/// The message of a revision, where any of it is wanted. A revision that is too large for a message is sent as a refusal, so that the client
+/// begins anew.
 fn change(kept: &Kept, patterns: &[FactPattern]) -> Option<Result<v1::WorldPoolServiceWatchResponse, Status>> {
     let (mut written, mut gone) = (Vec::new(), Vec::new());
     for (key, fact) in kept.written.iter().filter(|(key, _)| wanted(key, patterns)) {

@@ -1,21 +1,21 @@
-//! How much memory facts and changes take, about: themselves, what they own, and their places in tables. Not what they share with others
-//! (names of writers).
+//! Approximate memory of facts and changes in bytes: themselves, the data that they own, and their entries in tables. Shared data (names
+//! of writers) is not counted.
 
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint, Term};
 use ratn_model::measurement::{Certainty, Measurement};
 use ratn_model::value::{Trajectory, TrajectoryPoint, Value};
 use ratn_world::world::{Fact, Written};
 
-/// What a fact takes in the tables and orders of a world, besides its key and its value.
+/// Bytes of a fact in the tables and indexes of a world, besides its key and its value.
 const PLACE: usize = 256;
 
-/// Of a fact that is written: its key, its value and its place.
+/// Bytes of a written fact: its key, its value and its table entries.
 pub(super) fn of_fact(key: &FactKey, fact: &Fact) -> usize {
     let measured = fact.measured.as_deref().map_or(0, of_measurement);
     of_key(key) + size_of::<Fact>() + of_value(&fact.value) + measured
 }
 
-/// Of a key, and of its place.
+/// Bytes of a key with its table entries.
 pub(super) fn of_key(key: &FactKey) -> usize {
     PLACE + size_of::<FactKey>() + key.predicate.len() + key.arguments.iter().map(of_term).sum::<usize>()
 }
@@ -58,7 +58,7 @@ fn of_measurement(measured: &Measurement) -> usize {
     size_of::<Measurement>() + measured.source.len() + numbers * size_of::<f64>()
 }
 
-/// What a value owns; it stands itself in what owns it.
+/// Bytes that a value owns; the value itself is counted by its owner.
 fn of_value(value: &Value) -> usize {
     match value {
         Value::Null | Value::Bool(_) | Value::Int(_) | Value::Float(_) | Value::Pose(_) => 0,

@@ -10,7 +10,7 @@ use ratn_model::id::LeaseId;
 use std::time::Duration;
 use tonic::{Code, Status};
 
-/// When to try again after a bound was reached.
+/// Retry delay after a limit was reached.
 const RETRY_DELAY: Duration = Duration::from_millis(200);
 
 pub(super) fn of_commit(error: &CommitError) -> Status {
@@ -25,7 +25,7 @@ pub(super) fn of_commit(error: &CommitError) -> Status {
     status(code, reason, error.to_string())
 }
 
-/// For programs `oldest_revision` and `newest_revision`: what is kept.
+/// Details for programs: `oldest_revision` and `newest_revision` that are kept.
 pub(super) fn of_revision(error: RevisionError) -> Status {
     match error {
         RevisionError::Future { .. } => status(Code::FailedPrecondition, "NO_SUCH_REVISION", error.to_string()),
@@ -73,14 +73,14 @@ pub(super) fn of_too_much(error: &TooMuch) -> Status {
     status(Code::ResourceExhausted, "QUERY_TOO_LARGE", error.to_string())
 }
 
-/// It would wait for what it is about, and too much waits.
+/// The call would have to wait for a projection or commit, and too many calls wait already.
 pub(super) fn too_many_wait() -> Status {
     let message = format!(
         "{} calls, or {} of one caller, wait for projections and commits that are on their way: ask again later",
         parked::MOST,
         parked::MOST_OF_ONE
     );
-    // As a daemon that is not there for a moment: what it is about may be there by then.
+    // Reported like a daemon that is unavailable for a moment: the projection or commit may exist by the time of the retry.
     retry_later(Code::Unavailable, "TOO_MANY_WAIT", message, parked::PATIENCE)
 }
 
@@ -89,7 +89,7 @@ pub(super) fn lease_ended(lease: LeaseId) -> Status {
     status(Code::FailedPrecondition, "LEASE_ENDED", message)
 }
 
-/// One that was never given looks the same as one that the resource manager has just given: so it is to be asked for again.
+/// An unknown lease looks like one that the resource manager has just given, so the client should retry.
 pub(super) fn lease_not_known(lease: LeaseId) -> Status {
     let message = format!(
         "{lease} is not known to the world pool: it was never given, or holds nothing, or the resource manager has not told of it yet; ask \

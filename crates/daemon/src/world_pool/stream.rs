@@ -1,5 +1,5 @@
-//! The calls of a client's stream, each as if it had come alone, from the stream's caller. Where the stream breaks, what has reached the actor
-//! is done: commits and projections may be asked for again by the same ids.
+//! The calls on a client's stream, each handled like a separate call of the stream's caller. If the stream breaks, calls that have reached the
+//! actor are still performed: commits and projections can be requested again by the same ids.
 
 use super::service::Service;
 use crate::access::Caller;
@@ -16,10 +16,10 @@ use ratn_worker::trace::{self, TraceContext};
 use tonic::{Code, Status};
 use tracing::Instrument;
 
-/// What a request that asks for nothing counts as.
+/// The path under which an empty request is counted.
 const CALLS: &str = "/ratn.v1.WorldPoolService/Calls";
 
-/// What performs the calls of one caller.
+/// Performs the calls of one caller.
 #[derive(Debug)]
 pub(super) struct CallerService {
     service: Service,

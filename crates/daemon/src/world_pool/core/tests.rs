@@ -54,7 +54,7 @@ fn project(pool: &mut WorldPool, request: &str, base: u64, lease: u64) -> Result
     })
 }
 
-/// What a query finds.
+/// The result of a query.
 fn query(
     pool: &WorldPool,
     id: Option<ProjectionId>,
@@ -165,7 +165,7 @@ fn a_fact_with_a_time_to_live_is_gone_after_it_unless_it_was_written_again() {
     let full = Change::Set { fact: FactKey { predicate: "full".to_owned(), ..key("box") }, value: Value::Int(1) };
     pool.commit(second(0.0), &of("a", vec![set("box", 1), set("cup", 1), full])).unwrap();
     pool.commit(second(1.0), &of("b", vec![set("cup", 1)])).unwrap();
-    // Asked again: it is as old as it was.
+    // A refused commit does not renew the fact.
     pool.commit(second(1.5), &of("a", vec![set("box", 1), set("cup", 1)])).unwrap_err();
     assert_eq!(pool.next_expiry(), Some(second(2.0)));
     pool.expire_facts(second(1.9));
@@ -193,7 +193,7 @@ fn what_does_not_fit_the_ontology_is_not_committed() {
     let mut pool = WorldPool::new(config, Some(ontology), history, 0);
     let refused = commit(&mut pool, "a", &[set("box", 1)], None).unwrap_err();
     assert!(matches!(refused, CommitError::Violation(_)), "{refused}");
-    // Sure in a way that the predicate does not declare.
+    // A kind of certainty that the predicate does not declare.
     let fact = FactKey { predicate: "full".to_owned(), ..key("box") };
     let changes = vec![Change::Set { fact: fact.clone(), value: Value::Int(1) }];
     let measured = Measurement { source: "scale".to_owned(), certainty: Some(Certainty::Confidence(0.9)) };
@@ -220,7 +220,7 @@ fn a_fact_says_who_wrote_it_and_what_measured_it() {
     assert!(facts.iter().all(|(_, fact)| fact.writer.as_deref() == Some("detect[1]")));
     assert_eq!(facts[0].1.measured.as_deref(), Some(&measured));
     assert_eq!(facts[1].1.measured, None);
-    // In a projection each fact says who will have written it.
+    // In a projection each fact names the node that will have written it.
     let request = ProjectRequest {
         by: operator(),
         request_id: "p".to_owned(),
@@ -272,7 +272,7 @@ fn a_commit_says_which_projections_it_contradicts_in_which_fact() {
     assert_eq!(found, vec![expected.clone()]);
     assert_eq!(pool.contradiction(of_cup), Ok(Some(&expected)));
     assert_eq!(pool.contradiction(of_box), Ok(None), "what it did not read is nothing to it");
-    // Made of a revision that is not the newest: what has happened since counts.
+    // A projection of an older revision: the commits since then count.
     let of_all = ProjectRequest {
         by: operator(),
         request_id: "late".to_owned(),
@@ -286,7 +286,7 @@ fn a_commit_says_which_projections_it_contradicts_in_which_fact() {
     };
     let late = pool.project(of_all).unwrap();
     assert_eq!(pool.contradiction(late), Ok(Some(&Contradiction { projection: late, ..expected })));
-    // What was predicted of a writer comes true, or otherwise.
+    // The predicted effect of a writer comes true, or comes otherwise.
     let of = |id: &str, value| Commit {
         id: id.to_owned(),
         changes: vec![set("box", value)],
@@ -327,13 +327,13 @@ fn a_projection_made_late_knows_that_a_deletion_predicted_of_its_writer_came_tru
     };
     let late = pool.project(late).unwrap();
     assert_eq!(pool.contradiction(late), Ok(None), "it came as predicted");
-    // What comes true does not come again: that the box is there once more is a difference.
+    // An effect comes true once: a second commit of the fact is a contradiction.
     commit(&mut pool, "c", &[set("box", 1)], None).unwrap();
     let found: Vec<_> = pool.take_contradictions().into_iter().map(|found| (found.projection, found.is)).collect();
     assert_eq!(found, [(late, Some(Value::Int(1)))]);
 }
 
-/// A projection that nothing but time ends.
+/// A projection without a lease.
 fn project_as(pool: &mut WorldPool, by: &Caller, request: &str) -> Result<ProjectionId, ProjectError> {
     pool.project(ProjectRequest {
         by: by.clone(),
@@ -389,13 +389,13 @@ fn one_caller_makes_so_many_projections_and_the_last_ones_of_all_are_operators()
     assert_eq!(project_as(&mut pool, &cain, "2"), Err(ProjectError::KeptForOperators { limit: 5 }));
     project_as(&mut pool, &operator(), "1").unwrap();
     assert_eq!(project_as(&mut pool, &operator(), "2"), Err(ProjectError::TooMany { limit: 6 }));
-    // What time has ended counts no more.
+    // Projections that have expired no longer count.
     pool.expire(Timestamp(5));
     assert!(pool.projections() == 0 && pool.in_memory.is_empty());
     project_as(&mut pool, &adam, "4").unwrap();
 }
 
-/// With so many bytes of its own, at least.
+/// A projection with at least this many bytes of its own.
 fn project_large(
     pool: &mut WorldPool,
     caller: &Caller,
@@ -425,7 +425,8 @@ fn projections_are_bounded_by_their_bytes_for_each_caller_and_in_all() {
     };
     let mut pool = WorldPool::new(config.clone(), None, History::new(&config), 0);
     let [adam, eve, cain] = ["adam", "eve", "cain"].map(task);
-    // Each has its value in what it shows, in what moves in the scene, and in what its commit is compared with.
+    // Each value is stored in the projection's facts, in its moves in the scene, and for comparison with
+    // commits.
     let first = project_large(&mut pool, &adam, "1", 2 * MIB).unwrap();
     project_large(&mut pool, &adam, "2", 2 * MIB).unwrap();
     let quota = ProjectError::QuotaOfBytes { whose: "adam".into(), limit: 13 * MIB };
@@ -445,7 +446,7 @@ fn projections_are_bounded_by_their_bytes_for_each_caller_and_in_all() {
     assert_eq!(project_large(&mut pool, &operator(), "2", 3 * MIB), Err(beyond));
     pool.expire(Timestamp(5));
     assert!(pool.in_memory.is_empty());
-    // A pattern that deletes much is small on the wire, and not here.
+    // A deletion by pattern is small on the wire, but large in memory.
     let many: Vec<Change> = (0..60_000).map(|n| set(&format!("{n}"), n)).collect();
     commit(&mut pool, "many", &many, None).unwrap();
     let all = FactPattern { predicate: "at".to_owned(), arguments: vec![None] };
@@ -490,7 +491,7 @@ mod kept_for_projections {
     proptest! {
         #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..ProptestConfig::default() })]
 
-        /// By looking at every fact of every base and of every revision that is kept.
+        /// Compares with a count over every fact of every base and of every kept revision.
         #[test]
         fn what_is_kept_for_projections_alone_is_counted_once(steps in vec((0..4_u8, 0..6_i64, 0..8_usize), 1..60)) {
             let config = WorldPoolConfig { revisions_kept: 3, ..WorldPoolConfig::default() };
@@ -546,7 +547,7 @@ fn the_commit_of_another_is_another_and_an_operator_goes_on_with_what_anybody_be
     assert_eq!(commit_as(task("adam"), 1), Ok(Revision(1)));
 }
 
-/// Of `adam`'s, of everything.
+/// A request of `adam` that reads everything.
 fn promised(request: &str, id: Option<ProjectionId>, after: Option<&str>) -> ProjectRequest {
     ProjectRequest {
         by: task("adam"),
@@ -561,7 +562,7 @@ fn promised(request: &str, id: Option<ProjectionId>, after: Option<&str>) -> Pro
     }
 }
 
-/// With room for the projections of tasks.
+/// A pool with room for the projections of tasks.
 fn large_pool() -> WorldPool {
     let config = WorldPoolConfig::default();
     let history = History::new(&config);
@@ -583,7 +584,7 @@ fn a_promised_id_is_used_once_by_whom_it_was_promised_to() {
     assert_eq!(pool.project(promised("one", Some(id), None)), Ok(id), "asked again, for the answer was lost");
     let again = pool.project(promised("another", Some(id), None));
     assert_eq!(again, Err(ProjectError::NotPromised { id, caller: "adam".into() }));
-    // Nobody else gets the one that is not used yet.
+    // No other caller gets the id that is not used yet.
     let other = pool.project(promised("three", None, None)).unwrap();
     assert!(!ids.contains(&other));
 }
@@ -620,7 +621,7 @@ fn a_projection_stands_on_the_commit_that_it_names() {
     let later = ProjectRequest { base: Revision(2), ..promised("two", None, Some("a")) };
     let later = pool.project(later).unwrap();
     assert_eq!(value(&pool, Some(later), "box"), Ok(Some(Value::Int(2))));
-    // A commit of somebody else by that name is another.
+    // Another caller's commit with the same id is a different commit.
     let of_eve = ProjectRequest { by: task("eve"), ..promised("three", None, Some("a")) };
     assert!(matches!(pool.project(of_eve), Err(ProjectError::NoSuchCommit { .. })));
 }
