@@ -1,6 +1,6 @@
-//! The user that a worker runs as, where that is another one than its process manager's: only root may do that. Supplementary groups are
-//! dropped, and the worker's files are in a directory of that user's in the runtime directory, which others may pass through then and
-//! not look into.
+//! The user that a worker runs as, where that differs from its process manager's user: only root may do that. Supplementary groups are
+//! dropped, and the worker's files are in that user's own directory below the runtime directory. Other users can then traverse the
+//! runtime directory, but not list it.
 
 use super::template::Template;
 use nix::unistd::{Gid, Uid, User, geteuid};
@@ -11,7 +11,7 @@ use std::io;
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt, lchown};
 use std::path::{Path, PathBuf};
 
-/// Who may pass through a directory may not see what is in it.
+/// Mode of a directory that others may traverse but not list.
 const PASSABLE: u32 = 0o711;
 
 #[derive(Debug, Clone, PartialEq)]
@@ -23,7 +23,7 @@ pub(super) struct Account {
 }
 
 impl Account {
-    /// The user of that name; why not, in words.
+    /// The account of this user name, or an error message.
     pub(super) fn named(name: &str) -> Result<Account, String> {
         if !geteuid().is_root() {
             return Err(format!("only root may run workers as `{name}`"));
@@ -35,7 +35,7 @@ impl Account {
         }
     }
 
-    /// Makes the directory of its workers.
+    /// Creates the directory of this user's workers.
     pub(super) fn make_directory(&self, runtime: &RuntimeDirectory, own: &RuntimeDirectory) -> io::Result<()> {
         let parent = own.path().parent().unwrap_or(own.path());
         DirBuilder::new().recursive(true).mode(0o700).create(own.path())?;
@@ -45,19 +45,19 @@ impl Account {
         self.give(own.path())
     }
 
-    /// What is there becomes this user's; not what a link of theirs leads to.
+    /// Makes the user the owner of a file; of a symbolic link the link itself, not its target.
     pub(super) fn give(&self, path: &Path) -> io::Result<()> {
         lchown(path, Some(self.uid.as_raw()), Some(self.gid.as_raw()))
     }
 
-    /// Who and where it is, for its environment.
+    /// The user's name and home, for the environment of its workers.
     pub(super) fn environment(&self) -> [(OsString, OsString); 3] {
         let (name, home) = (OsString::from(&self.name), self.home.clone().into_os_string());
         [("USER".into(), name.clone()), ("LOGNAME".into(), name), ("HOME".into(), home)]
     }
 }
 
-/// Where the workers of a template have their files.
+/// The directory for the files of a template's workers.
 pub(super) fn directory_of(runtime: &RuntimeDirectory, template: &Template) -> RuntimeDirectory {
     match &template.user {
         Some(user) => RuntimeDirectory::at(runtime.path().join("users").join(user)),

@@ -1,4 +1,4 @@
-//! The one task that owns the pools. It performs their commands and hands them the events that follow.
+//! The one task that owns the pools. It performs their commands and passes the resulting events to them.
 
 use super::config::{Labels, ProcessManagerConfig};
 use super::drained::Drained;
@@ -30,7 +30,7 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-/// Messages that wait for the actor; more make their senders wait.
+/// Capacity for messages to the actor; beyond it senders wait.
 const INBOX: usize = 256;
 /// Answers to health checks that are handled in one turn.
 const AT_ONCE: usize = 256;
@@ -45,7 +45,7 @@ const SHUTDOWN_PATIENCE: Duration = Duration::from_millis(400);
 /// The actor waits this long for workers that it has killed at the end.
 const KILL_PATIENCE: Duration = Duration::from_millis(400);
 
-/// What the service asks of the actor.
+/// Requests of the service.
 #[derive(Debug)]
 pub(super) enum Message {
     List { answer: oneshot::Sender<HostPools> },
@@ -64,13 +64,13 @@ pub(super) struct Handle {
     inbox: mpsc::Sender<Message>,
 }
 
-/// What the actor is made of.
+/// The parts of the actor.
 pub(super) struct Parts {
     pub(super) config: ProcessManagerConfig,
     pub(super) directory: RuntimeDirectory,
-    /// What is trusted and shown where workers are asked for their health.
+    /// TLS settings for health checks of workers.
     pub(super) tls: ClientTls,
-    /// What workers are told of the resource manager.
+    /// Address and session of the resource manager, for workers.
     pub(super) told: ManagerContact,
     pub(super) roster: Roster,
     /// Knows which processes belong to which worker.
@@ -81,9 +81,9 @@ pub(super) struct Parts {
     pub(super) before: Vec<String>,
     /// The workers among them that were taken over.
     pub(super) adopted: Vec<Adopted>,
-    /// What the others moved and may still move.
+    /// What earlier workers moved and may still move.
     pub(super) motions: Motions,
-    /// The resources that the link shall offer.
+    /// The resources that the link is to offer.
     pub(super) wanted: watch::Sender<Wanted>,
     /// The ids of offered resources that are withdrawn as soon as nobody holds them.
     pub(super) drains: watch::Sender<BTreeSet<String>>,
@@ -91,7 +91,7 @@ pub(super) struct Parts {
     pub(super) offer_events: mpsc::Receiver<OfferEvent>,
     /// Which workers are held.
     pub(super) uses: mpsc::Receiver<Use>,
-    /// The demand for workers that nobody has.
+    /// The demand for workers that do not exist.
     pub(super) demand: mpsc::Receiver<Vec<Demand>>,
     /// Why the demand cannot be met.
     pub(super) short: watch::Sender<Shortages>,
@@ -99,7 +99,7 @@ pub(super) struct Parts {
     pub(super) looks: mpsc::Receiver<Sample>,
     /// Has the id of the session that offers the workers.
     pub(super) session_file: SessionFile,
-    /// The link asks for another id: that of now is another caller's.
+    /// Requests of the link for another session id, because the present one belongs to another caller.
     pub(super) renewals: mpsc::Receiver<oneshot::Sender<String>>,
 }
 
@@ -120,7 +120,7 @@ struct Actor {
     session_file: SessionFile,
 }
 
-/// Starts the actor; it ends with the token, once every worker has.
+/// Starts the actor. `shutdown` ends it, once every worker has ended.
 pub(super) fn start(
     parts: Parts,
     vitals: Vitals,
@@ -226,7 +226,7 @@ impl Actor {
                 Some(sample) = inputs.looks.recv() => self.handle(Event::Looked(sample)),
                 Some(answer) = inputs.renewals.recv() => self.renew_session(answer),
                 Some(message) = inputs.messages.recv() => self.receive(message),
-                // What could not be written is tried again, whatever else happens.
+                // A file that could not be written is tried again, whatever else happens.
                 _ = tick.tick() => self.perform(Vec::new()),
                 () = sleep_until(deadline) => self.handle(Event::Time),
                 () = shutdown.cancelled() => break,
@@ -242,8 +242,8 @@ impl Actor {
         self.perform(commands);
     }
 
-    /// The session that offers the workers has another id from now on. Those that were told of the one before take leases of somebody else's
-    /// resources for those of their own: all of them are withdrawn and ended at once, and others take their places.
+    /// The session that offers the workers gets another id. Workers that know only the old id would take another caller's leases for their
+    /// own, so all of them are withdrawn, ended at once and replaced.
     fn renew_session(&mut self, answer: oneshot::Sender<String>) {
         let (id, written) = self.session_file.renew();
         if let Err(error) = written {
@@ -253,11 +253,11 @@ impl Actor {
         self.processes.offered_by(&id);
         let commands = self.pools.renew(self.now());
         self.perform(commands);
-        // None of them is wanted any more.
+        // By now no old worker is to be offered any more.
         let _ = answer.send(id);
     }
 
-    /// Ends every worker, whatever it takes.
+    /// Ends every worker, by force if necessary.
     async fn end(&mut self, outcomes: &mut mpsc::Receiver<Outcome>) {
         self.watchers.clear();
         let commands = self.pools.shut_down(self.now(), SHUTDOWN_PATIENCE);
@@ -278,7 +278,7 @@ impl Actor {
         Timestamp(u64::try_from(self.start.elapsed().as_nanos()).unwrap_or(u64::MAX))
     }
 
-    // Answers that nobody waits for any more are of no consequence.
+    // An answer whose receiver is gone does no harm.
     fn receive(&mut self, message: Message) {
         let now = self.now();
         match message {
@@ -311,7 +311,7 @@ impl Actor {
         }
     }
 
-    /// The ids of the workers that are still there.
+    /// Starts or ends the drain; returns the ids of the workers that still exist.
     fn drain(&mut self, draining: bool) -> std::io::Result<Vec<String>> {
         self.drained.set(draining)?;
         let commands = self.pools.drain(self.now(), draining);
@@ -361,7 +361,7 @@ impl Actor {
     }
 
     fn perform(&mut self, commands: Vec<Command>) {
-        // Before anything of it is offered.
+        // The motions are written before any of their workers is offered.
         let kept = self.processes.keep_motions(&self.pools.motions(self.now()));
         let mut commands = self.withheld.pass(commands, kept);
         while let Some(command) = commands.pop_front() {
@@ -380,7 +380,7 @@ impl Actor {
                     self.wanted.send_if_modified(|wanted| wanted.remove(&id).is_some());
                     self.drains.send_if_modified(|drains| drains.remove(&id));
                 }
-                // Also where it drains already: then it is tried at once.
+                // Sent even where the worker is draining already: then the withdrawal is tried at once.
                 Command::Retire { id } => self.drains.send_modify(|drains| {
                     drains.insert(id);
                 }),
@@ -407,7 +407,7 @@ impl Actor {
     }
 }
 
-/// What the clock of the wall shows; nothing is decided by it.
+/// Wall-clock time; no decision depends on it.
 #[allow(clippy::disallowed_methods, reason = "somebody asks how far the clocks of hosts are apart")]
 fn wall_clock_us() -> u64 {
     let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();

@@ -1,5 +1,5 @@
-//! What a worker says of itself beside what the catalogue says of its kind: differences are logged when the worker is ready, because a
-//! task that was checked against the catalogue would wait for ever, or fail.
+//! Compares a worker's description of itself with the catalogue. Differences are logged when the worker is ready, because a task that
+//! was checked against the catalogue would wait for ever or fail.
 
 use ratn_model::catalogue::Catalogue;
 use ratn_worker::client::{ActionClient, Channels, DescribeError};
@@ -8,20 +8,20 @@ use ratn_worker::tls::ClientTls;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// A worker that has not described itself by then does not.
+/// Timeout of a worker's description; a worker without an answer has none.
 const PATIENCE: Duration = Duration::from_secs(2);
 
-/// What one worker is compared with.
+/// What a worker is compared with.
 #[derive(Debug)]
 pub(super) struct Comparison {
     pub(super) catalogue: Arc<Catalogue>,
-    /// The kind of resource that its template says it is.
+    /// The kind of resource according to its template.
     pub(super) kind: String,
     pub(super) tls: ClientTls,
 }
 
 impl Comparison {
-    /// Asks the worker, and logs each difference.
+    /// Asks the worker for its description, and logs each difference.
     pub(super) async fn tell(self, id: &str, endpoint: &str) {
         let Ok(endpoint) = endpoint.parse::<Endpoint>() else { return };
         match ActionClient::new(Channels::new(&self.tls)).description(&endpoint, PATIENCE).await {
@@ -31,7 +31,7 @@ impl Comparison {
                 }
             }
             Err(refused @ DescribeError::Refused(_)) => tracing::warn!(id, "{refused}"),
-            // A worker need not describe itself.
+            // A worker need not have a description.
             Err(unanswered @ DescribeError::Unanswered(_)) => tracing::debug!(id, "{unanswered}"),
         }
     }

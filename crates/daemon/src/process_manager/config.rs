@@ -15,16 +15,16 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// Names that labels cannot have.
+/// Attribute names that labels may not use.
 const TAKEN: [&str; 9] =
     ["host", "pid", "endpoint", "cores", "load_per_core", "idle_cores", "free_memory_mib", "free_disk_mib", "level"];
-/// A name of a template or a host has at most so many bytes: ids are made of both.
+/// Maximum length of the name of a template or a host in bytes: ids contain both.
 const MAX_NAME_BYTES: usize = 48;
 
-/// What is said of a host, by name.
+/// The labels of a host, by name.
 pub type Labels = BTreeMap<String, Label>;
 
-/// Something that is said of a host.
+/// A label of a host.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Label {
@@ -34,7 +34,7 @@ pub enum Label {
     Int(i64),
     /// A number.
     Float(f64),
-    /// A word.
+    /// A text.
     Text(String),
 }
 
@@ -57,32 +57,33 @@ pub struct ProcessManagerConfig {
     pub listen: Endpoint,
     /// The name of this host: the end of every worker's id, `path-planner-1@compute`.
     pub host: String,
-    /// Where the resource manager is; without it, where the runtime directory says.
+    /// Address of the resource manager; without it the address in the runtime directory is used.
     pub resource_manager: Option<Endpoint>,
-    /// The session lives this long without an answer from the resource manager, in milliseconds.
+    /// Time to live of the session without an answer from the resource manager, in milliseconds.
     pub session_ttl_ms: u64,
-    /// A directory of cgroup v2 that is the process manager's to divide, `/sys/fs/cgroup/ratn`: then `limits` are kept by a group for
-    /// each worker, and with all that it starts.
+    /// A cgroup v2 directory that the process manager may divide, such as `/sys/fs/cgroup/ratn`: then each worker has a group of its own,
+    /// which enforces `limits` for the worker and all processes that it starts.
     pub cgroup: Option<PathBuf>,
-    /// How the processes of workers are kept track of, so that all of a worker ends with it.
+    /// How the processes of workers are tracked, so that all of a worker's processes end with it.
     pub tracking: Tracking,
-    /// This process is a process manager and nothing else: what workers leave behind becomes its children, and ends with it. Said by
-    /// the program, not by its config.
+    /// This process is only a process manager: orphans of workers become its children, and end with it. Set by the program, not by its
+    /// config.
     #[serde(skip)]
     pub owns_process: bool,
-    /// Directories of cgroup v1 that are the process manager's to divide, one for each controller; where `cgroup` is not given.
+    /// Directories of cgroup v1 that the process manager may divide, one for each controller; used where `cgroup` is not set.
     pub cgroup_v1: GroupsV1,
-    /// What else is to be said of this host and its workers, for tasks that choose by it: `gpu = true`.
+    /// Further attributes of this host and its workers, for tasks that choose by them: `gpu = true`.
     pub labels: Labels,
-    /// What of this machine is offered.
+    /// The part of this machine that is offered.
     pub machine: MachineConfig,
-    /// A worker's log file is begun anew beyond this size, in bytes (the one before is kept as `.log.1`).
+    /// A worker's log file is rotated beyond this size, in bytes (the previous one is kept as `.log.1`).
     pub max_log_bytes: u64,
-    /// What every worker has in its environment besides, as where the roles of its callers are ([`ratn_worker::access::ACCESS_VARIABLE`]).
-    /// Not of the file: of who starts the process manager.
+    /// Additional environment of every worker, such as where the roles of its callers are ([`ratn_worker::access::ACCESS_VARIABLE`]). Set
+    /// by the program that starts the process manager, not by the file.
     #[serde(skip)]
     pub worker_environment: BTreeMap<&'static str, PathBuf>,
-    /// What workers that describe themselves are compared with. Not of this section of the file: of who starts the process manager.
+    /// The catalogue that workers' descriptions are compared with. Set by the program that starts the process manager, not by this section
+    /// of the file.
     #[serde(skip)]
     pub catalogue: Option<Arc<Catalogue>>,
     /// The pools.
@@ -112,8 +113,8 @@ impl Default for ProcessManagerConfig {
 }
 
 impl ProcessManagerConfig {
-    /// The kinds of its workers, and how many there are of each at the most. Of several templates of a kind the first one, in the
-    /// order of names, meets demand.
+    /// The kinds of its workers, and the maximum number of each. Where several templates have the same kind, the first one by name meets
+    /// demand.
     pub(crate) fn kinds(&self) -> BTreeMap<String, Provision> {
         let mut templates: Vec<&Template> = self.templates.iter().collect();
         templates.sort_by(|a, b| b.name.cmp(&a.name));
@@ -124,7 +125,7 @@ impl ProcessManagerConfig {
 }
 
 impl ProcessManagerConfig {
-    /// Of each template that cannot be started on this machine which, and why.
+    /// A message for each template that cannot be started on this machine: which one, and why.
     pub fn obstacles(&self) -> Vec<String> {
         let obstacle = |template: &Template| Some(format!("template `{}`: {}", template.name, template.obstacle()?));
         self.templates.iter().filter_map(obstacle).collect()

@@ -1,4 +1,5 @@
-//! The drain of this host, in which it takes no new work: a file of the runtime directory, so that it outlasts a restart of the process manager.
+//! The drain of this host, in which it takes no new work: stored as a file in the runtime directory, so that it outlasts a restart of the
+//! process manager.
 
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::io;

@@ -1,9 +1,10 @@
-//! The environment of a worker: clean, but for what programs need to run at all and what its template names.
+//! The environment of a worker: only variables that programs need to run at all, and those that its template
+//! names.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 
-/// Passed on from the process manager's own environment, where set; and whatever begins with `RATN_`.
+/// Variables that are passed on from the process manager's own environment, where set.
 pub(super) const PASSED: [&str; 11] = [
     "PATH",
     "HOME",
@@ -17,10 +18,10 @@ pub(super) const PASSED: [&str; 11] = [
     "RUST_LOG",
     "SSL_CERT_FILE",
 ];
-/// And these: how a client reaches the daemons.
+/// Variables with this prefix are passed on as well: they tell a client how to reach the daemons.
 const PREFIX: &str = "RATN_";
 
-/// What of `own` a worker gets that is to get `also`.
+/// The variables of `own` that a worker gets whose template names `also`.
 pub(super) fn passed(own: impl Iterator<Item = (OsString, OsString)>, also: &[String]) -> BTreeMap<OsString, OsString> {
     let passes =
         |name: &str| PASSED.contains(&name) || name.starts_with(PREFIX) || also.iter().any(|known| known == name);

@@ -1,7 +1,8 @@
-//! Limits of a worker (memory, processors, processes, files): enforced by a group of cgroup v2 of its own where the config names a directory for them, else by
-//! groups of cgroup v1, one for each controller that it names a directory for, else by the limits of its process (`setrlimit(2)`), as far as these go. What is in force is said, never assumed.
+//! Limits of a worker (memory, processors, processes, files). They are enforced by a cgroup v2 group of the worker where the config names a directory for such
+//! groups; else by cgroup v1 groups, one for each controller that has a directory; else by resource limits of the process (`setrlimit(2)`), as far as these go.
+//! The limits that are in force are reported, never assumed.
 //!
-//! They are set right after the process is started: nothing may run in the child before its program does.
+//! They are set right after the process is started, because no code of ours may run in the child before its program does.
 
 use super::open_files;
 use crate::config::{ConfigError, rule};
@@ -11,25 +12,25 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// What the time of `cpus` is counted over, in microseconds.
+/// Period over which the time of `cpus` is counted, in microseconds.
 const PERIOD_US: u64 = 100_000;
 const MIB: u64 = 1 << 20;
-/// Who is killed is gone from a group within this; longer where it has much memory to give back.
+/// A killed process usually leaves its group within this time; it takes longer where much memory has to be freed.
 const EMPTY_PATIENCE: Duration = Duration::from_millis(200);
-/// The pause between two tries.
+/// Pause between two tries to remove a group.
 const EMPTY_AGAIN: Duration = Duration::from_millis(1);
 
 /// All keys are optional; without one there is no limit.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
-    /// Memory, in MiB: of a group all that it uses; of a process its data.
+    /// Memory, in MiB: all memory of a group; without a group the data of the process.
     pub memory_mib: Option<u64>,
-    /// Processors; needs a group.
+    /// Number of processors; needs a group.
     pub cpus: Option<f64>,
-    /// Processes and threads; needs a group.
+    /// Number of processes and threads; needs a group.
     pub processes: Option<u64>,
-    /// Files open at once.
+    /// Number of open files.
     pub open_files: Option<u64>,
 }
 
@@ -45,17 +46,17 @@ pub struct GroupsV1 {
     pub pids: Option<PathBuf>,
 }
 
-/// Where groups are made.
+/// Directories in which groups are made.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Groups {
-    /// Of the config: for limits, and for all that a worker starts.
+    /// From the config: for limits, and to track all processes of a worker.
     pub(super) v2: Option<PathBuf>,
     pub(super) v1: GroupsV1,
-    /// Without one of the config: for all that a worker starts, and for no limits.
+    /// Used where the config has no `v2`: only to track all processes of a worker, not for limits.
     pub(super) tracking: Option<PathBuf>,
 }
 
-/// What is in force for a worker; its groups go with this.
+/// The limits in force for a worker; dropping this removes its groups.
 #[derive(Debug, Default)]
 pub(super) struct AppliedLimits {
     words: Vec<String>,
@@ -76,7 +77,7 @@ impl Limits {
         rule(key("open_files"), self.open_files.is_none_or(|count| (16..=1 << 30).contains(&count)), "at least 16")
     }
 
-    /// Puts them on a process that has just been started.
+    /// Applies the limits to a process that has just been started.
     pub(super) fn enforce(&self, id: &str, pid: u32, groups: &Groups) -> AppliedLimits {
         let mut force = AppliedLimits::default();
         let mut missing = *self;
@@ -120,7 +121,7 @@ impl Limits {
         force
     }
 
-    /// Each that cgroup v1 has a directory for, alone, with that directory.
+    /// Each limit for which cgroup v1 has a directory, with that directory.
     fn by_controller(&self, v1: &GroupsV1) -> Vec<(PathBuf, Limits)> {
         let none = Limits::default();
         let memory =
@@ -140,7 +141,7 @@ impl Limits {
         }
     }
 
-    /// A group of cgroup v1 with the one limit that is there, and the process in it.
+    /// Makes a cgroup v1 group with the one limit that is set, and moves the process into it.
     fn group_v1(&self, place: &Path, id: &str, pid: u32) -> io::Result<Group> {
         let group = Group { path: place.join(id) };
         std::fs::create_dir_all(&group.path)?;
@@ -158,7 +159,7 @@ impl Limits {
         Ok(group)
     }
 
-    /// A group with these limits, and the process in it.
+    /// Makes a group with these limits, and moves the process into it.
     fn group(&self, groups: &Path, id: &str, pid: u32) -> io::Result<Group> {
         let group = Group { path: groups.join(id) };
         std::fs::create_dir_all(&group.path)?;
@@ -166,7 +167,7 @@ impl Limits {
         if let Some(mib) = self.memory_mib {
             write("memory.max", (mib * MIB).to_string())?;
             write("memory.swap.max", "0".to_owned()).or_else(|error| match error.kind() {
-                // A kernel without accounting of swap.
+                // The kernel has no swap accounting.
                 io::ErrorKind::NotFound => Ok(()),
                 _ => Err(error),
             })?;
@@ -183,7 +184,7 @@ impl Limits {
 }
 
 impl AppliedLimits {
-    /// Those of a worker that was taken over, whose groups go with this.
+    /// The limits of a worker that was taken over; dropping this removes its groups.
     pub(super) fn adopted(groups: Vec<PathBuf>) -> AppliedLimits {
         AppliedLimits { words: Vec::new(), groups: groups.into_iter().map(|path| Group { path }).collect() }
     }
@@ -199,7 +200,7 @@ impl AppliedLimits {
         self.words.extend(limits.processes.map(|count| format!("{count} processes ({by})")));
     }
 
-    /// In words, for people; empty without limits.
+    /// Text for people; empty without limits.
     pub(super) fn words(&self) -> String {
         self.words.join(", ")
     }
@@ -227,10 +228,10 @@ impl Drop for Group {
     }
 }
 
-/// What a worker started and left behind ends with it. The group is gone where nobody is left.
+/// Kills what a worker started and left behind. The group is removed where nobody is left.
 pub(super) fn end_group(path: &Path) {
     if std::fs::write(path.join("cgroup.kill"), "1").is_err() {
-        // Of cgroup v1.
+        // A cgroup v1 group.
         let left = std::fs::read_to_string(path.join("cgroup.procs")).unwrap_or_default();
         for pid in left.split_whitespace().filter_map(|pid| Pid::from_raw(pid.parse().ok()?)) {
             let _ = rustix::process::kill_process(pid, rustix::process::Signal::KILL);
@@ -238,7 +239,7 @@ pub(super) fn end_group(path: &Path) {
     }
     let begin = Instant::now();
     while let Err(error) = std::fs::remove_dir(path) {
-        // Those that are killed are in it until they are gone.
+        // Killed processes stay in the group until they are gone.
         if error.kind() != io::ErrorKind::ResourceBusy || begin.elapsed() > EMPTY_PATIENCE {
             return tracing::debug!(group = %path.display(), %error, "a group of a worker stays");
         }
@@ -272,12 +273,12 @@ mod tests {
         let words = "memory 64 MiB (cgroup v1), 1.5 cpus (cgroup v1), processes not limited: no cgroup, \
                      100 open files (rlimit)";
         assert_eq!(force.words(), words);
-        // These are files of a disk, and the child is in none of them.
+        // These are ordinary files, and the child is in none of them.
         child.kill().unwrap();
         child.wait().unwrap();
     }
 
-    /// The kernel's own, where this machine has them and they may be divided.
+    /// Uses the kernel's own groups, where this machine has them and they may be divided.
     #[test]
     fn a_group_of_the_kernel_s_cgroup_v1_holds_and_goes_with_its_worker() {
         let place = PathBuf::from(format!("/sys/fs/cgroup/pids/ratn-test-{}", std::process::id()));
@@ -319,7 +320,7 @@ mod tests {
         assert_eq!(force.words(), words);
     }
 
-    /// A directory that takes what is written; which groups the kernel makes of it is the kernel's business.
+    /// An ordinary directory takes the writes; this does not test what the kernel does with them.
     #[test]
     fn with_groups_each_worker_has_one_of_its_own() {
         let groups = tempfile::tempdir().unwrap();

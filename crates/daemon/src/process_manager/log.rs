@@ -1,5 +1,5 @@
-//! The output of a worker: into a bounded file, with its end kept in memory, to answer why the worker died. Of the workers that
-//! have ended, the logs of the last ones are kept.
+//! The output of a worker: written to a bounded file, with its end kept in memory to explain why the worker died. The logs of
+//! the last workers that ended are kept.
 
 use super::log_file::previous;
 use std::collections::VecDeque;
@@ -11,29 +11,29 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::sync::Notify;
 
-/// How much of the end is kept.
+/// Bytes of the end that are kept.
 const LAST_WORDS_BYTES: usize = 400;
-/// How much is read at once.
+/// Bytes that are read at once.
 const CHUNK_BYTES: usize = 4_096;
-/// Bytes of a line that are looked at.
+/// Bytes of a line that are searched.
 const MAX_LINE_BYTES: usize = 4_096;
-/// How often a file is looked at that a worker writes to by itself.
+/// Interval at which the size of a file is checked that a worker writes to by itself.
 pub(super) const BOUND_INTERVAL: Duration = Duration::from_secs(1);
-/// So many ended workers leave a log.
+/// Number of ended workers whose logs are kept.
 const ENDED_LOGS_KEPT: usize = 64;
 
-/// A worker's log; clones write to the same.
+/// A worker's log; clones write to the same file.
 #[derive(Debug, Clone)]
 pub(super) struct Log {
     inner: Arc<Mutex<Inner>>,
 }
 
-/// A line that somebody waits for.
+/// A line that marks the worker as ready.
 #[derive(Debug)]
 pub(super) struct Awaited {
     text: String,
     seen: Arc<Notify>,
-    /// The line that is being written, as far as it is looked at.
+    /// The current line, up to the bytes that are searched.
     line: Vec<u8>,
 }
 
@@ -46,20 +46,20 @@ struct Inner {
     tail: VecDeque<u8>,
 }
 
-/// The logs of workers that have ended, the oldest first.
+/// The logs of workers that have ended, oldest first.
 #[derive(Debug, Default)]
 pub(super) struct EndedLogs {
     paths: VecDeque<PathBuf>,
 }
 
 impl EndedLogs {
-    /// One more has ended; the oldest beyond those kept is removed.
+    /// Adds the log of a worker that has ended; removes the oldest beyond those that are kept.
     pub(super) fn add(&mut self, path: PathBuf) {
         self.paths.push_back(path);
         if self.paths.len() > ENDED_LOGS_KEPT
             && let Some(oldest) = self.paths.pop_front()
         {
-            // Somebody may have removed it before.
+            // The file may already be gone.
             let _ = fs::remove_file(previous(&oldest));
             let _ = fs::remove_file(oldest);
         }
@@ -77,20 +77,20 @@ impl Log {
         Ok(Log { inner: Arc::new(Mutex::new(inner)) })
     }
 
-    /// One that somebody else writes to, and goes on with when this process is gone.
+    /// A log that another process writes to, and continues to write to when this process is gone.
     pub(super) fn of_another(path: &Path, max_bytes: u64) -> io::Result<Log> {
         let file = File::options().append(true).create(true).open(path)?;
         let inner = Inner { path: path.to_owned(), file, written: 0, max_bytes, tail: VecDeque::new() };
         Ok(Log { inner: Arc::new(Mutex::new(inner)) })
     }
 
-    /// The file, for a process that writes to its end by itself.
+    /// The file, opened to append, for a process that writes to it by itself.
     pub(super) fn file(&self) -> io::Result<File> {
         let inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
         File::options().append(true).open(&inner.path)
     }
 
-    /// Keeps a file bounded that somebody else writes to: what it has is copied away, and it is cut to nothing. Does not end.
+    /// Keeps a file bounded that another process writes to: copies its content away and truncates it. Never returns.
     pub(super) async fn keep_bounded(self, every: Duration) {
         loop {
             tokio::time::sleep(every).await;
@@ -103,20 +103,20 @@ impl Log {
         }
     }
 
-    /// Copies until the other side ends.
+    /// Copies until the writer closes.
     pub(super) async fn capture(self, mut from: impl AsyncRead + Unpin, mut awaited: Option<Awaited>) {
         let mut chunk = vec![0; CHUNK_BYTES];
         while let Ok(length @ 1..) = from.read(&mut chunk).await {
             awaited = awaited.and_then(|awaited| awaited.after(&chunk[..length]));
             let mut inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
             if let Err(error) = inner.write(&chunk[..length]) {
-                // The worker goes on; a full disk costs its log only.
+                // The worker goes on; a full disk costs only its log.
                 tracing::warn!(file = %inner.path.display(), %error, "a worker's log is not written");
             }
         }
     }
 
-    /// The last lines, in one.
+    /// The last lines, joined into one.
     pub(super) fn last_words(&self) -> String {
         let inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
         let (front, back) = inner.tail.as_slices();
@@ -137,12 +137,12 @@ fn end_of(path: &Path) -> io::Result<Vec<u8>> {
 }
 
 impl Awaited {
-    /// A line with `text` in it makes `seen` known.
+    /// Notifies `seen` when a line contains `text`.
     pub(super) fn new(text: &str, seen: Arc<Notify>) -> Awaited {
         Awaited { text: text.to_owned(), seen, line: Vec::new() }
     }
 
-    /// What is still awaited after more was written.
+    /// Processes more output; returns `None` once the line was found.
     fn after(mut self, written: &[u8]) -> Option<Awaited> {
         for byte in written {
             if *byte != b'\n' {

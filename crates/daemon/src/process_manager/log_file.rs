@@ -1,5 +1,5 @@
-//! Reading a worker's log: the older file that was kept, the current one, and what is written from then on, also when the file is
-//! begun anew or cut to nothing.
+//! Reading a worker's log: the older file that was kept, the current one, and everything written from then on, also when the file
+//! is rotated or truncated.
 
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::fs::File;
@@ -7,15 +7,15 @@ use std::io::{self, Read, Seek};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-/// Read at once at the most.
+/// Maximum bytes per read.
 pub const CHUNK_BYTES: usize = 65_536;
 
-/// Where the log of a worker is, of those that a runtime directory has; its id is part of the file's name.
+/// The log file of a worker in a runtime directory; the worker's id is part of the file's name.
 pub fn log_file(directory: &RuntimeDirectory, worker: &str) -> PathBuf {
     directory.path().join("logs").join(format!("{worker}.log"))
 }
 
-/// Where what was written before a log was begun anew is kept.
+/// The file that keeps the output from before the last rotation.
 pub fn previous(log: &Path) -> PathBuf {
     log.with_extension("log.1")
 }
@@ -24,24 +24,24 @@ pub fn previous(log: &Path) -> PathBuf {
 #[derive(Debug)]
 pub struct LogReader {
     path: PathBuf,
-    /// Of the file that is read; of the one kept of before it is the other's.
+    /// Inode of the current file; it tells when the file was replaced.
     inode: u64,
     file: File,
     before: Option<File>,
 }
 
 impl LogReader {
-    /// From its beginning, or from the beginning of what was kept of before.
+    /// Opens the log from its beginning, including the kept older file.
     ///
     /// # Errors
-    /// Where it cannot be read; `NotFound` where there is none.
+    /// Where it cannot be read; `NotFound` where there is no log.
     pub fn open(path: &Path) -> io::Result<LogReader> {
         let file = File::open(path)?;
         let inode = file.metadata()?.ino();
         Ok(LogReader { path: path.to_owned(), inode, file, before: File::open(previous(path)).ok() })
     }
 
-    /// What comes next, at most [`CHUNK_BYTES`]; nothing when nothing was written since the last call.
+    /// The next bytes, at most [`CHUNK_BYTES`]; empty when nothing was written since the last call.
     ///
     /// # Errors
     /// Where it cannot be read.
@@ -58,7 +58,7 @@ impl LogReader {
             self.file.rewind()?;
             return next(&mut self.file);
         }
-        // Of the one before all has been read only now.
+        // Only now all of the replaced file has been read.
         if bytes.is_empty() && std::fs::metadata(&self.path).is_ok_and(|now| now.ino() != self.inode) {
             *self = LogReader { before: None, ..LogReader::open(&self.path)? };
             return next(&mut self.file);

@@ -1,4 +1,5 @@
-//! A worker's log for a client: in pieces, as it is written, until its worker has ended and all of it was sent.
+//! Streams a worker's log to a client: in pieces, as it is written, until the worker has ended and everything
+//! was sent.
 
 use super::log_file::LogReader;
 use crate::details::status;
@@ -8,15 +9,15 @@ use std::time::Duration;
 use tokio::sync::{OwnedSemaphorePermit, mpsc};
 use tonic::{Code, Status};
 
-/// How often a log that is followed is looked at.
+/// Interval at which a followed log is read.
 const LOOK_INTERVAL: Duration = Duration::from_millis(100);
-/// Pieces that wait for a client; a slow one is waited for.
+/// Pieces that may wait for a client; then reading waits for the client.
 const BUFFER: usize = 4;
 
-/// What a client gets.
+/// The stream of a client.
 pub(super) type Pieces = mpsc::Receiver<Result<ReadLogResponse, Status>>;
 
-/// Sends a log; `lives` says whether its worker does. Without it the log is sent as it is now.
+/// Sends a log; `lives` says whether its worker is alive. Without `lives` the log is sent as it is now.
 pub(super) fn send<F>(
     reader: LogReader,
     mut lives: Option<impl FnMut() -> F + Send + 'static>,
@@ -40,7 +41,7 @@ where
             let piece = match read {
                 Ok(chunk) if chunk.is_empty() && ends => return,
                 Ok(chunk) if chunk.is_empty() => {
-                    // Asked before the last look: what it wrote until its end is read all the same.
+                    // Asked before the last read, so that everything the worker wrote until its end is sent.
                     if let Some(lives) = &mut lives {
                         ends = !lives().await;
                     }

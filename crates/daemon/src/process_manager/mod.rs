@@ -66,13 +66,13 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 use tracking::Tracker;
 
-/// The role's name: of its endpoint file, its command and its section of a config.
+/// The name of the role: in its endpoint file, its command and its section of a config.
 pub const ROLE: &str = "process-manager";
 /// Reports of the link that wait for the actor.
 const OFFER_EVENTS: usize = 1_024;
-/// A child that was being started when its process manager was killed holds the place until its program begins.
+/// A child that was being started when the last process manager was killed holds the lock until its program begins.
 const TAKE_PATIENCE: Duration = Duration::from_millis(500);
-/// States of the demand that the actor was not told of yet.
+/// Capacity for demand that the actor has not received yet.
 const DEMANDS: usize = 16;
 
 pub use ratn_proto::types::HOST_KIND;
@@ -89,7 +89,7 @@ pub async fn run(
     run_as(config, directory, Serving::default(), ClientTls::none(), shutdown).await
 }
 
-/// As [`run`], served as its host wants it; `tls` is what it trusts and shows as a client.
+/// As [`run`], served in the way that its host wants; `tls` is what it trusts and shows as a client.
 ///
 /// # Errors
 /// As [`run`].
@@ -110,7 +110,7 @@ pub async fn run_as(
     let tracker = Tracker::start(&config, &directory).context("cannot keep track of workers")?;
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
-    // Before anything is offered: what the last process manager offered goes where it is not wanted any more.
+    // Done before anything is offered: offers of the last process manager that are not wanted any more are withdrawn.
     let starting = left.starting.iter().map(|intent| &intent.id);
     let before: Vec<String> = left.workers.iter().map(|entry| &entry.id).chain(starting).cloned().collect();
     let mut motions = left.motions.clone();
@@ -119,7 +119,7 @@ pub async fn run_as(
     let told = ManagerContact { manager: processes::manager_of(&config, &directory), session: session.clone() };
     let adopted = predecessor::settle(left, (&config.host, &config.templates), &told, &directory, &tracker).await;
     roster.keep_only(&adopted.iter().map(|one| one.entry.id.as_str()).collect());
-    // Of a template with an adopted worker, the link waits where that worker was not offered before.
+    // For a template with an adopted worker, the link waits instead where that worker was not offered before.
     motions.retain(|name, _| adopted.iter().all(|one| one.entry.template.name != *name));
     let (wanted, to_offer) = watch::channel(Wanted::new());
     let workers = adopted.iter().map(|one| {

@@ -1,4 +1,5 @@
-//! Resources that a process manager offers to the resource manager: its host with what the machine has, and every worker that is ready.
+//! Resources that a process manager offers to the resource manager: its host with measurements of the machine, and every worker that is
+//! ready.
 
 use super::HOST_KIND;
 use super::config::{Labels, ProcessManagerConfig};
@@ -12,13 +13,13 @@ use std::time::Duration;
 
 const MIB: u64 = 1 << 20;
 
-/// This host, by whose endpoint its process manager is found.
+/// The resource of this host, with the endpoint of its process manager.
 pub(super) fn host(config: &ProcessManagerConfig, endpoint: &Endpoint) -> Resource {
     let host = of_host(format!("host@{}", config.host), ResourceClass::System, HOST_KIND, &config.host, &config.labels);
     host.with_endpoint(endpoint)
 }
 
-/// With what there is of it now: memory and disk in MiB, load and idle processors rounded to hundredths.
+/// Adds current measurements: memory and disk in MiB, load and idle processors rounded to hundredths.
 pub(super) fn host_with(host: Resource, sample: &Sample) -> Resource {
     let mib = |bytes: u64| Value::Int(i64::try_from(bytes / MIB).unwrap_or(i64::MAX));
     host.with_attribute("cores", Value::Int(sample.cores.into()))
@@ -28,19 +29,19 @@ pub(super) fn host_with(host: Resource, sample: &Sample) -> Resource {
         .with_attribute("free_disk_mib", mib(sample.free_disk_bytes))
 }
 
-/// Its processors, for who wants some to itself; nothing where there are none.
+/// The resource of its processors, for clients that want some to themselves; `None` where there are none.
 pub(super) fn cores(host: &str, labels: &Labels, cores: u32) -> Option<Resource> {
     let resource = of_host(format!("cores@{host}"), ResourceClass::System, "Core", host, labels);
     (cores > 0).then(|| resource.with_capacity(cores))
 }
 
-/// Its battery, as the simulated cell offers its own.
+/// The resource of its battery, like the one that the simulated cell offers.
 pub(super) fn battery(host: &str, level: f64) -> Resource {
     let resource = Resource::new(format!("battery@{host}"), ResourceClass::System, "Battery").divisible();
     resource.with_attribute("level", rounded(level)).on_host(host)
 }
 
-/// A worker, as a resource of `kind`; of what moves with the bound for its standstill.
+/// The resource of a worker; `standstill` is the time in which a worker's device stops after the worker's end, where it moves one.
 pub(super) fn worker(
     host: &str,
     labels: &Labels,
@@ -53,12 +54,12 @@ pub(super) fn worker(
         Some(bound) => resource.with_standstill(bound),
         None => resource,
     };
-    // One that is no server has none.
+    // A worker that is not a server has no endpoint.
     let resource = if worker.endpoint.is_empty() { resource } else { resource.with_endpoint(&worker.endpoint) };
     resource.with_attribute("pid", Value::Int(i64::from(worker.pid)))
 }
 
-/// What everything of a host has in common, with every worker of it that there may ever be.
+/// Attributes that the host and all its present and future workers have in common.
 pub(super) fn attributes(host: &str, labels: &Labels) -> BTreeMap<String, Value> {
     let labels = labels.iter().map(|(name, label)| (name.clone(), label.into()));
     labels.chain([("host".to_owned(), Value::String(host.to_owned()))]).collect()

@@ -1,10 +1,12 @@
-//! The start order of templates: no worker of one is started before a worker of each in its `after` is ready.
+//! The start order of templates: no worker of a template is started before each template in its `after` has a
+//! ready worker.
 
 use super::template::Template;
 use crate::config::{ConfigError, rule};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Refuses what could never start: templates that are not there, have no worker unasked, or wait for each other.
+/// Refuses orders that could never start: templates that do not exist, that have no worker without demand, or
+/// that wait for each other.
 pub(super) fn check(templates: &[Template]) -> Result<(), ConfigError> {
     let by_name: BTreeMap<&str, &Template> =
         templates.iter().map(|template| (template.name.as_str(), template)).collect();

@@ -1,15 +1,15 @@
-//! The parameters of a template: typed, with a range, and filled in where arguments and variables name them, `{name}`.
+//! The parameters of a template: typed, with a range, and substituted where arguments and variables name them as `{name}`.
 
 use crate::config::{ConfigError, rule};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// What is filled in everywhere; `speed` and `robot` are filled in by the command that starts a process manager.
+/// Names that are always substituted; `speed` and `robot` are substituted by the command that starts a process manager.
 const BUILT_IN: [&str; 7] = ["id", "kind", "host", "runtime_dir", "endpoint_file", "speed", "robot"];
-/// Bytes of a text.
+/// Maximum bytes of a text.
 const MAX_TEXT_BYTES: usize = 4_096;
 
-/// A value of a type, in its range.
+/// A typed value with its range.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Parameter {
@@ -44,14 +44,14 @@ pub enum Parameter {
     Text {
         /// The value.
         value: String,
-        /// One of these, unless there are none.
+        /// Allowed values; any value where the list is empty.
         #[serde(default)]
         one_of: Vec<String>,
     },
 }
 
 impl Parameter {
-    /// Says what is wrong with it; `at` is its place in the config.
+    /// Reports what is wrong with it; `at` is its place in the config.
     pub(super) fn check(&self, at: &str, name: &str) -> Result<(), ConfigError> {
         rule(at, is_name(name), "a name is of small letters, digits and `_`")?;
         rule(at, !BUILT_IN.contains(&name), format!("`{{{name}}}` is filled in already"))?;
@@ -84,7 +84,7 @@ impl Parameter {
     }
 }
 
-/// The text with every `{name}` that `builtin` or a parameter knows replaced, once: what is filled in is not looked at again.
+/// Replaces every `{name}` that `builtin` or a parameter knows, once: inserted text is not searched again.
 pub(super) fn fill(
     text: &str,
     builtin: &dyn Fn(&str) -> Option<String>,
@@ -104,7 +104,7 @@ pub(super) fn fill(
     filled
 }
 
-/// The first `{name}` that nobody knows.
+/// The first `{name}` that is unknown.
 pub(super) fn unknown<'t>(text: &'t str, parameters: &BTreeMap<String, Parameter>) -> Option<&'t str> {
     let mut rest = text;
     while let Some((_, name, after)) = next(rest) {
@@ -116,7 +116,7 @@ pub(super) fn unknown<'t>(text: &'t str, parameters: &BTreeMap<String, Parameter
     None
 }
 
-/// The text before the first `{name}`, the name, and what follows. Other braces are text.
+/// The text before the first `{name}`, the name, and the rest. Other braces are ordinary text.
 fn next(text: &str) -> Option<(&str, &str, &str)> {
     text.match_indices('{').find_map(|(at, _)| {
         let (name, after) = text[at + 1..].split_once('}')?;

@@ -28,22 +28,22 @@ use tokio::io::unix::AsyncFd;
 use tokio::net::UnixStream;
 use tokio::time::timeout;
 
-/// A worker that is to be adopted takes a connection at once.
+/// Timeout of the connection to a worker that is to be adopted.
 const GREETING_PATIENCE: Duration = Duration::from_secs(1);
-/// From SIGKILL to the end of a process of much memory.
+/// Time from SIGKILL to the end of a process with much memory.
 const KILL_PATIENCE: Duration = Duration::from_secs(5);
 
-/// A worker that was taken over.
+/// A worker that was adopted.
 #[derive(Debug)]
 pub(super) struct Adopted {
     pub(super) entry: Entry,
-    /// As long as this is open, it has a parent.
+    /// The worker considers its parent alive while this is open.
     pub(super) parent_lives: UnixStream,
     pub(super) exit: Exit,
-    /// What it moves may go on for so long when its process is gone: the widest of the bounds of its template then, its template now, and
-    /// what was written down of it. Nothing for one that moves nothing.
+    /// How long its device may go on moving after the worker's end: the longest of the bounds of its template then, its template now, and
+    /// the roster. `None` for a worker without a device.
     pub(super) standstill: Option<Duration>,
-    /// Its template has changed, or the resource manager's place: it is to be replaced.
+    /// Its template or the resource manager's address has changed: it is to be replaced.
     pub(super) outdated: bool,
 }
 
@@ -65,16 +65,16 @@ impl Adopted {
     }
 }
 
-/// The end of a process that is no child of this one.
+/// The end of a process that is not a child of this one.
 #[derive(Debug)]
 pub(super) struct Exit(AsyncFd<OwnedFd>);
 
 impl Exit {
-    /// Of the process that began then; nothing where it is gone.
+    /// Of the process in `entry`; `None` where it has ended.
     fn of(entry: &Entry) -> Option<Exit> {
         let pid = rustix::process::Pid::from_raw(i32::try_from(entry.pid).ok()?)?;
         let fd = rustix::process::pidfd_open(pid, rustix::process::PidfdFlags::empty()).ok()?;
-        // Looked at after the descriptor was had: it is that process, or none.
+        // Checked after the descriptor was opened, so the descriptor is of that process.
         (began(entry.pid)? == entry.began).then_some(())?;
         #[allow(deprecated, reason = "an owned descriptor stays the same and open, which is what the warning is about")]
         AsyncFd::with_interest(fd, tokio::io::Interest::READABLE).ok().map(Exit)
@@ -85,22 +85,22 @@ impl Exit {
     }
 }
 
-/// When a process began, in ticks of the kernel (`proc_pid_stat(5)`, field 22); nothing of one that has ended.
+/// Start time of a process, in clock ticks of the kernel (`proc_pid_stat(5)`, field 22); `None` where it has ended.
 pub(super) fn began(pid: u32) -> Option<u64> {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-    // The name before may have spaces and parentheses.
+    // The name in the field before may contain spaces and parentheses.
     let mut fields = stat.rsplit_once(')')?.1.split_whitespace();
     let state = fields.next()?;
     (state != "Z" && state != "X").then_some(())?;
     fields.nth(18)?.parse().ok()
 }
 
-/// Where a worker listens for a successor.
+/// The socket on which a worker listens for a successor.
 pub(super) fn adopt_socket(directory: &RuntimeDirectory, id: &str) -> PathBuf {
     directory.path().join(format!("{id}.adopt"))
 }
 
-/// Adopts or ends all of them; those that were adopted. Returns when the others are gone, and so is what was being started.
+/// Adopts or ends all of them; returns the adopted ones. Returns when the others have ended, and so have those that were being started.
 pub(super) async fn settle(
     left: LeftBehind,
     (host, templates): (&str, &[Template]),
@@ -125,7 +125,7 @@ pub(super) async fn settle(
                 }
             },
             None => {
-                // Nobody else has its number for as long as something that it started is in its group.
+                // The kernel does not reuse the id of the process group while a process of it is left.
                 if !Path::new(&format!("/proc/{}", entry.pid)).exists() {
                     spawner::signal(entry.pid, Signal::SIGKILL);
                 }
@@ -164,18 +164,18 @@ async fn greet(
     let Some(template) = templates.iter().find(|template| template.name == entry.template.name) else {
         return Err((exit, "its template is gone"));
     };
-    // The pool gives its workers other ids, and would start one beside this one.
+    // The pool gives its workers other ids, and would start another worker besides this one.
     if pools::number_of(&entry.id, &template.name, host).is_none() {
         return Err((exit, "its id is not one of this host: the host had another name"));
     }
     if !(template.adopt && entry.template.adopt) {
         return Err((exit, "its template does not say `adopt`"));
     }
-    // Others of its template are no longer kept from moving what it moves.
+    // Other workers of its template no longer wait until its device stands still.
     if template.standstill_ms.is_none() && entry.template.standstill_ms.is_some() {
         return Err((exit, "it moves something, and its template does not say `standstill_ms` any more"));
     }
-    // The one that it was told of may be somebody else's, whose leases it would confirm.
+    // Its session may belong to another caller, whose leases it would accept.
     if entry.session.as_ref() != Some(&told.session) {
         return Err((exit, "it was told of another session"));
     }
@@ -195,8 +195,8 @@ async fn greet(
     }
 }
 
-/// Whether a worker of now would be another one: of another template, or told of another resource manager. One that asks a manager
-/// which is not that of the system confirms no lease of it.
+/// Whether a worker that is started now would differ: by its template, or by the resource manager that it is told of. A worker that asks
+/// another manager than the system's confirms no lease of the system.
 fn is_outdated(entry: &Entry, template: &Template, told: &ManagerContact) -> bool {
     entry.manager.as_ref() != Some(&told.manager.to_string()) || !template.starts_the_same_as(&entry.template)
 }
@@ -209,7 +209,7 @@ async fn end(entry: &Entry, exit: &Exit) {
             tracing::error!(id = entry.id, pid = entry.pid, "a worker of the last process manager does not end");
         }
     }
-    // What it had started, in its group of processes.
+    // Kills what it had started in its process group.
     spawner::signal(entry.pid, Signal::SIGKILL);
 }
 
@@ -222,7 +222,7 @@ fn remove_files(id: &str, template: &Template, directory: &RuntimeDirectory) {
     remove_files_in(&account::directory_of(directory, template), id);
 }
 
-/// What a worker leaves that was killed.
+/// Removes the files of a worker that was killed.
 pub(super) fn remove_files_in(directory: &RuntimeDirectory, id: &str) {
     let served = match directory.socket(id) {
         Endpoint::Unix(path) => Some(path),

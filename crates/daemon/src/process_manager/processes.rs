@@ -1,4 +1,4 @@
-//! The processes of the workers: begins them from their templates, signals them, waits until they serve, and clears up behind them.
+//! The processes of the workers: starts them from their templates, signals them, waits until they serve, and cleans up after them.
 
 use super::account::{self, Account};
 use super::comparison::Comparison;
@@ -36,21 +36,21 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::AbortHandle;
 use tokio_util::task::AbortOnDropHandle;
 
-/// Events of processes that wait for the actor.
+/// Capacity for events of processes that the actor has not handled yet.
 const OUTCOMES: usize = 1_024;
 
-/// The pause between two looks for orphans that have ended.
+/// Interval at which ended orphans are reaped.
 const REAP_INTERVAL: Duration = Duration::from_secs(5);
 
-/// A part of this process, for the log.
+/// The name of this part of the process in its log.
 const HEALTH_OF_WORKER: &str = "the health check of a worker";
 
-/// What happens to the processes.
+/// Events of the processes.
 pub(super) struct ProcessEvents {
     pub(super) outcomes: mpsc::Receiver<Outcome>,
-    /// The id and the endpoint of each that serves.
+    /// The id and the endpoint of each worker that serves.
     pub(super) serving: mpsc::Receiver<(String, String)>,
-    /// The id of each that was asked whether it still serves, with its answer.
+    /// The id of each worker that got a health check, with the result.
     pub(super) health: mpsc::Receiver<(String, Result<(), String>)>,
 }
 
@@ -77,11 +77,11 @@ pub(super) struct Processes {
     host: String,
     tls: ClientTls,
     told: ManagerContact,
-    /// Whether the process manager itself is reached by its socket in the runtime directory alone.
+    /// Whether the process manager is reached only by its socket in the runtime directory.
     is_local: bool,
     /// Variables in the environment of every worker.
     worker_environment: BTreeMap<&'static str, PathBuf>,
-    /// What workers are compared with, where that is known.
+    /// The catalogue that workers are compared with, where it is known.
     catalogue: Option<Arc<Catalogue>>,
     max_log_bytes: u64,
     /// The directories in which cgroups are made.
@@ -121,13 +121,13 @@ struct Process {
 /// What workers are told of the resource manager, which confirms the leases of their goals.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct ManagerContact {
-    /// Where it is.
+    /// The address of the resource manager.
     pub(super) manager: ManagerLocation,
-    /// The session that offers them there.
+    /// The session that offers the workers there.
     pub(super) session: String,
 }
 
-/// Where the workers of a process manager are told that the resource manager is.
+/// The address of the resource manager for the workers of a process manager.
 pub(super) fn manager_of(config: &ProcessManagerConfig, directory: &RuntimeDirectory) -> ManagerLocation {
     match &config.resource_manager {
         Some(endpoint) => ManagerLocation::At(endpoint.clone()),
@@ -153,7 +153,7 @@ impl Processes {
             host: config.host.clone(),
             tls,
             told,
-            // A worker's socket is for its own user and group alone.
+            // A worker's socket is only for its own user and group.
             is_local: config.listen.is_local() && sockets == &SocketAccess::default(),
             worker_environment: config.worker_environment.clone(),
             catalogue: config.catalogue.clone(),
@@ -216,7 +216,7 @@ impl Processes {
         let marker = self.tracker.environment(id);
         env.insert(RESOURCE_MANAGER_VARIABLE.into(), self.told.manager.to_string().into());
         env.insert(PROVIDER_SESSION_VARIABLE.into(), self.told.session.clone().into());
-        // What this process has of it, if anything, is another's.
+        // A value from this process's own environment is not for the worker.
         env.remove(OsStr::new(STANDSTILL_VARIABLE));
         env.extend(template.standstill_ms.map(|bound| (STANDSTILL_VARIABLE.into(), bound.to_string().into())));
         env.remove(OsStr::new(STUCK_VARIABLE));
@@ -257,7 +257,7 @@ impl Processes {
             program: program.unwrap_or_else(|| self.this_program.clone()),
         };
         let place = self.jobs.try_reserve().map_err(|_| BeginError::Busy)?;
-        // Written before the process exists: a successor knows of every process.
+        // Recorded before the process exists, so that a successor knows every process.
         let group = self.tracker.group_of(id);
         self.roster.starts(Intent { id: id.to_owned(), group, template: template.clone() });
         place.send(job);
@@ -307,15 +307,15 @@ impl Processes {
         }
     }
 
-    /// The socket that a worker listens on unless its template says otherwise: where both managers are reached by their sockets in the runtime
-    /// directory alone, so is it, unless others than this user and group may connect there. On loopback a call costs more, and other users could
-    /// make one.
+    /// The socket of a worker whose template does not say otherwise: where both managers are reached only by their sockets in the runtime
+    /// directory, the worker uses one, too, unless others than this user and group may connect there. A call over loopback TCP costs more, and
+    /// other users could make one.
     fn socket_for(&self, id: &str, directory: &RuntimeDirectory) -> Option<Endpoint> {
         let manager = directory.find(resource_manager::ROLE).ok()?;
         let is_meant = self.is_local
             && matches!(self.told.manager, ManagerLocation::File(_))
             && directory.listen(&Endpoint::local(), resource_manager::ROLE).is_ok_and(|own| own == manager);
-        // One that is too long for a socket's path does not read.
+        // A path that is too long for a socket does not parse.
         is_meant.then(|| directory.socket(id).to_string().parse().ok()).flatten()
     }
 
@@ -349,7 +349,7 @@ impl Processes {
         spawner::watch_adopted(adopted, &self.log_file(&id), self.max_log_bytes, tracker, self.outcomes.clone());
     }
 
-    /// What may move from now on, for a successor; whether it would hear of it.
+    /// Records what may move from now on, for a successor; returns whether a successor would find it.
     pub(super) fn keep_motions(&mut self, motions: &Motions) -> bool {
         self.roster.keep_motions(motions)
     }
@@ -368,10 +368,10 @@ impl Processes {
         self.ended_logs.add(self.log_file(id));
     }
 
-    /// Asks a worker that serves whether it still does.
+    /// Sends a health check to a worker.
     pub(super) fn check(&self, id: &str, within: Duration) {
         if let Some((_, ask)) = self.by_id.get(id).and_then(|process| process.attended.as_ref()) {
-            // The queue is full while the last question has no answer: that answer will do.
+            // The queue is full while the last check has no answer: that answer will do.
             let _ = ask.try_send(within);
         }
     }
@@ -425,7 +425,7 @@ async fn attend(
 ) {
     let (endpoint, health_check) = match readiness_check.ready(&directory, &id, within).await {
         Ok((endpoint, health_check)) => {
-            // Its sender goes when it is known.
+            // Its sender is dropped when the process id is known.
             let _ = known.await;
             drop(senders.serving.send((id.clone(), endpoint.clone())).await);
             (endpoint, health_check)

@@ -1,28 +1,28 @@
-//! Workers that are Python scripts: which interpreter runs one, and with which arguments.
+//! Workers that are Python scripts: the interpreter and its arguments.
 //!
-//! A script's packages are those of its interpreter, so it is found where a project has its own: what the template says, a virtual environment
-//! beside the script or above it, the one that the process manager was started in, and `python3` at last.
+//! A script's packages are those of its interpreter, so the interpreter is looked for in this order: the one in the template, a virtual
+//! environment beside the script or in a folder above it, the environment in which the process manager was started, and finally `python3`.
 
 use std::path::{Path, PathBuf};
 
-/// Folders of virtual environments, as people name them.
+/// Usual folder names of virtual environments.
 const ENVIRONMENTS: [&str; 2] = [".venv", "venv"];
 const IN_ENVIRONMENT: &str = "bin/python";
 const ANY: &str = "python3";
-/// What a script gets before the arguments of its template: what every worker of the SDK takes.
+/// Arguments before those of the template: the ones that every worker of the SDK takes.
 const ARGUMENTS: [&str; 6] = ["--id", "{id}", "--endpoint-file", "{endpoint_file}", "--kind", "{kind}"];
 
-/// What runs a script.
+/// The interpreter of a script.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Interpreter {
-    /// A path, or a name that is looked for in `PATH`.
+    /// A path, or a name that is looked up in `PATH`.
     pub(super) program: PathBuf,
-    /// What says so.
+    /// Why this one was chosen.
     pub(super) because: &'static str,
 }
 
 impl Interpreter {
-    /// Of a script; `said` by its template, `active` is the environment that the process manager was started in.
+    /// Chooses the interpreter of a script; `said` is the template's, `active` the environment in which the process manager was started.
     pub(super) fn of(
         script: &Path,
         said: Option<&Path>,
@@ -44,7 +44,7 @@ impl Interpreter {
     }
 }
 
-/// The arguments of a script's interpreter.
+/// The arguments of the script's interpreter.
 pub(super) fn arguments(script: &Path, own: &[String]) -> Vec<String> {
     let first = std::iter::once(script.display().to_string());
     first.chain(ARGUMENTS.map(str::to_owned)).chain(own.iter().cloned()).collect()

@@ -15,42 +15,43 @@ use tokio::net::{TcpStream, UnixDatagram};
 use tokio::sync::Notify;
 use tokio_util::task::AbortOnDropHandle;
 
-/// The pause between two tries of a port.
+/// Pause between two connection attempts to a port.
 const TRY_AGAIN_AFTER: Duration = Duration::from_millis(20);
-/// A message of `sd_notify` is not longer.
+/// Maximum length of an `sd_notify` message.
 const MESSAGE_BYTES: usize = 4_096;
-/// Bytes of a line that is waited for.
+/// Maximum length of an awaited line in bytes.
 const MAX_LINE_BYTES: usize = 256;
 
 /// How a worker shows that it is ready.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Readiness {
-    /// It writes its endpoint file, and its gRPC health there says SERVING.
+    /// Its endpoint file exists, and its gRPC health there is SERVING.
     #[default]
     Health,
-    /// It says `READY=1` to the socket of `NOTIFY_SOCKET` (`sd_notify(3)`).
+    /// It sends `READY=1` to the socket of `NOTIFY_SOCKET` (`sd_notify(3)`).
     Notify {
-        /// It also says `WATCHDOG=1` there, more often than every `WATCHDOG_USEC` (`sd_watchdog_enabled(3)`); one that does not has hung.
+        /// It also sends `WATCHDOG=1` there, more often than every `WATCHDOG_USEC` (`sd_watchdog_enabled(3)`); otherwise it counts as
+        /// hung.
         #[serde(default)]
         watchdog: bool,
     },
-    /// A line of its standard output has this in it.
+    /// A line of its standard output contains this text.
     Line {
-        /// What.
+        /// The text.
         contains: String,
     },
-    /// A TCP port of loopback takes connections.
+    /// A TCP port on loopback accepts connections.
     Port {
-        /// Which.
+        /// The port.
         port: u16,
     },
 }
 
-/// What is looked at until a worker is ready.
+/// A check that waits until a worker is ready.
 #[derive(Debug)]
 pub(super) enum ReadinessCheck {
-    /// Asked with what the process manager trusts and shows.
+    /// Asked with the TLS settings of the process manager.
     Health(ClientTls),
     Notify {
         socket: UnixDatagram,
@@ -60,18 +61,18 @@ pub(super) enum ReadinessCheck {
     Port(u16),
 }
 
-/// What is asked whether a worker still serves.
+/// A check whether a worker still serves.
 #[derive(Debug)]
 pub(super) enum HealthCheck {
     Health(Health),
     Port(u16),
     Watchdog(Watchdog),
-    /// Nothing: it says so once.
+    /// There is none; the worker reports readiness once.
     None,
 }
 
 impl Readiness {
-    /// What a worker has not done that was not ready in time.
+    /// What a worker that was not ready in time has not done.
     pub(super) fn missing(&self, id: &str) -> String {
         match self {
             Readiness::Health => {
@@ -98,12 +99,12 @@ impl Readiness {
         }
     }
 
-    /// Whether a worker that is ready can be asked whether it still is.
+    /// Whether a ready worker can be checked later.
     pub(super) fn can_be_asked(&self) -> bool {
         matches!(self, Readiness::Health | Readiness::Port { .. } | Readiness::Notify { watchdog: true })
     }
 
-    /// What is asked of one that has been ready before; nothing where it cannot be.
+    /// The health check of a worker that was ready; `None` where there is none.
     pub(super) fn health_check(&self, socket: &Path, endpoint: &str, tls: &ClientTls) -> Option<HealthCheck> {
         match self {
             Readiness::Health => Some(HealthCheck::Health(Health::of(endpoint.parse().ok()?, tls))),
@@ -115,7 +116,7 @@ impl Readiness {
         }
     }
 
-    /// What to look at; before the worker is started. `socket` is where it may notify.
+    /// The readiness check, made before the worker is started. `socket` is where the worker may notify.
     pub(super) fn readiness_check(&self, socket: &Path, tls: &ClientTls) -> io::Result<ReadinessCheck> {
         Ok(match self {
             Readiness::Health => ReadinessCheck::Health(tls.clone()),
@@ -127,14 +128,14 @@ impl Readiness {
 }
 
 impl ReadinessCheck {
-    /// Returns where the worker serves (empty where it does not say) once it is ready.
+    /// Returns the worker's endpoint (empty where it has none) once it is ready.
     pub(super) async fn ready(
         self,
         directory: &RuntimeDirectory,
         id: &str,
         within: Duration,
     ) -> Result<(String, HealthCheck), String> {
-        // A worker that is no server has no endpoint.
+        // A worker that is not a server has no endpoint.
         let endpoint = || directory.find(id).map(|endpoint| endpoint.to_string()).unwrap_or_default();
         match self {
             ReadinessCheck::Health(tls) => {
@@ -163,7 +164,7 @@ impl ReadinessCheck {
 }
 
 impl HealthCheck {
-    /// Returns once it says that it serves.
+    /// Returns once the worker has shown that it serves.
     pub(super) async fn check(&mut self, within: Duration) -> Result<(), String> {
         match self {
             HealthCheck::Health(health) => health.serving(within).await.map_err(|error| error.to_string()),
@@ -186,10 +187,10 @@ impl HealthCheck {
     }
 }
 
-/// Listens to one that says again and again that it lives; read at once, so that who says it never has to wait.
+/// Receives the watchdog pings of a worker; they are read at once, so that the worker never has to wait.
 #[derive(Debug)]
 pub(super) struct Watchdog {
-    /// It has, since somebody asked last.
+    /// Notified by each ping; a waiting check takes it.
     heard: Arc<Notify>,
     _listening: AbortOnDropHandle<()>,
 }
@@ -212,7 +213,7 @@ fn bind(socket: &Path) -> io::Result<UnixDatagram> {
     UnixDatagram::bind(socket)
 }
 
-/// Returns once a message has this line.
+/// Returns once a message contains this line.
 async fn heard(socket: &UnixDatagram, wanted: &[u8]) -> io::Result<()> {
     let mut message = vec![0; MESSAGE_BYTES];
     loop {

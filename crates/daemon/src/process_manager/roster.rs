@@ -1,6 +1,5 @@
-//! The list of workers in a file of the runtime directory, so that a process manager that is started after one that was killed
-//! knows whom that one left behind, and what may still move though its worker is gone. Lines are appended as workers come and go; a lock
-//! keeps a second process manager away.
+//! The list of workers in a file of the runtime directory. From it the successor of a killed process manager learns which workers were left behind, and what
+//! may still move although its worker has ended. Lines are appended as workers come and go; a lock prevents a second process manager.
 
 use super::template::Template;
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -11,9 +10,9 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// The pause between two tries to take a place.
+/// Pause between two tries to take the lock.
 const TAKE_AGAIN: Duration = Duration::from_millis(10);
-/// Lines beyond those of the workers there are; then the file is written anew.
+/// Number of outdated lines at which the file is rewritten.
 const MOST_OLD_LINES: usize = 1_000;
 
 /// A worker as its process manager knew it.
@@ -21,29 +20,29 @@ const MOST_OLD_LINES: usize = 1_000;
 pub(super) struct Entry {
     pub(super) id: String,
     pub(super) pid: u32,
-    /// When its process began, in ticks of the kernel: a process id alone may be another's by now.
+    /// Start time of its process, in clock ticks of the kernel: a process id alone may be reused.
     pub(super) began: u64,
-    /// Where it serves; `None` while it did not.
+    /// Its endpoint; `None` until it served.
     pub(super) endpoint: Option<String>,
-    /// Where it was told that the resource manager is; nothing in what an older version wrote.
+    /// The address of the resource manager that it was told; `None` in files of older versions.
     #[serde(default)]
     pub(super) manager: Option<String>,
-    /// The session that it was told offers it; nothing in what an older version wrote.
+    /// The session that it was told offers it; `None` in files of older versions.
     #[serde(default)]
     pub(super) session: Option<String>,
-    /// What it may use of the machine, for people.
+    /// Its resource limits, for people.
     pub(super) limits: String,
-    /// Its groups of cgroups, if it has any.
+    /// Its cgroups, if it has any.
     pub(super) groups: Vec<PathBuf>,
-    /// As it was started from.
+    /// The template that it was started from.
     pub(super) template: Template,
 }
 
-/// A worker that is about to be started: written before its process is there, so that somebody knows of it however this ends.
+/// A worker that is about to be started: recorded before its process exists, so that the process is known whatever happens next.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Intent {
     pub(super) id: String,
-    /// The group of cgroups that it is put into, if any.
+    /// The cgroup that it is put into, if any.
     pub(super) group: Option<PathBuf>,
     pub(super) template: Template,
 }
@@ -51,18 +50,18 @@ pub(super) struct Intent {
 /// What the last process manager left.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct LeftBehind {
-    /// The workers that it had.
+    /// Its running workers.
     pub(super) workers: Vec<Entry>,
-    /// The workers that it was starting.
+    /// Its workers that were being started.
     pub(super) starting: Vec<Intent>,
-    /// What may still move for somebody.
+    /// Devices that may still move for a holder.
     pub(super) motions: Motions,
 }
 
-/// By the name of a template: what its workers move may go on for so long when their processes are gone.
+/// By template: how long its workers' devices may go on moving after their processes have ended.
 pub(super) type Motions = BTreeMap<String, Duration>;
 
-/// What happened to a worker.
+/// An event of a worker.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Line {
@@ -75,32 +74,32 @@ enum Line {
     Gone {
         id: String,
     },
-    /// From now on a worker of the template may move something, within this bound after its end.
+    /// From now on a worker of the template may move something, until this bound after its end.
     Moves {
         template: String,
         standstill_ms: u64,
     },
-    /// Nothing moves any more by a worker of the template.
+    /// No worker of the template moves anything any more.
     Rests {
         template: String,
     },
 }
 
-/// A process manager that cannot be one.
+/// Why a process manager cannot start.
 #[derive(Debug, thiserror::Error)]
 pub enum RosterError {
-    /// Another one has the place.
+    /// Another process manager runs in this runtime directory.
     #[error("a process manager runs in {} already: end it, or say another --runtime-dir", directory.display())]
     Taken {
         /// The runtime directory.
         directory: PathBuf,
     },
-    /// The file cannot be had.
+    /// The file cannot be used.
     #[error("cannot keep a list of the workers in {}", file.display())]
     Io {
-        /// Which.
+        /// The file.
         file: PathBuf,
-        /// Why.
+        /// The reason.
         #[source]
         source: io::Error,
     },
@@ -115,13 +114,13 @@ pub(super) struct Roster {
     starting: BTreeMap<String, Intent>,
     /// In milliseconds.
     motions: BTreeMap<String, u64>,
-    /// A line was not written, or only its beginning: what is known is to be written anew.
+    /// A line was not written, or only in part: the file has to be rewritten.
     unwritten: bool,
     _lock: File,
 }
 
 impl Roster {
-    /// As [`Roster::take`], asked again for so long where another one has the place.
+    /// As [`Roster::take`], tried again for this long while another process manager has the lock.
     pub(super) async fn take_within(
         directory: &RuntimeDirectory,
         patience: Duration,
@@ -135,7 +134,7 @@ impl Roster {
         }
     }
 
-    /// Takes the place of the one process manager of a runtime directory; what the last one left behind.
+    /// Becomes the one process manager of a runtime directory; returns what the last one left behind.
     pub(super) fn take(directory: &RuntimeDirectory) -> Result<(Roster, LeftBehind), RosterError> {
         let directory = directory.path();
         let path = directory.join("workers");
@@ -161,14 +160,14 @@ impl Roster {
         Ok((roster, left))
     }
 
-    /// All others are gone.
+    /// Marks all other workers as gone.
     pub(super) fn keep_only(&mut self, kept: &BTreeSet<&str>) {
         let known = self.there.keys().chain(self.starting.keys());
         let gone: Vec<String> = known.filter(|id| !kept.contains(id.as_str())).cloned().collect();
         gone.iter().for_each(|id| self.gone(id));
     }
 
-    /// Before its process is started.
+    /// To be called before the process is started.
     pub(super) fn starts(&mut self, intent: Intent) {
         self.starting.insert(intent.id.clone(), intent.clone());
         self.append(&Line::Starts(Box::new(intent)));
@@ -194,8 +193,8 @@ impl Roster {
         }
     }
 
-    /// What may move now; called before a worker that moves something is offered. A successor that hears of a motion waits for its bound,
-    /// however this process manager and its workers end. Whether it would hear of it: false where the file could not be written, also now.
+    /// Records what may move now; called before a worker that moves something is offered. A successor that reads of a motion waits for its bound, however this
+    /// process manager and its workers end. Returns false where the file could not be written, now or before: then a successor would not know.
     pub(super) fn keep_motions(&mut self, now: &Motions) -> bool {
         let ms = |bound: &Duration| u64::try_from(bound.as_millis()).unwrap_or(u64::MAX);
         let now: BTreeMap<String, u64> = now.iter().map(|(name, bound)| (name.clone(), ms(bound))).collect();
@@ -217,8 +216,8 @@ impl Roster {
         !self.unwritten
     }
 
-    /// The workers go on where it cannot be written: only a successor would not know of them. After a line that failed nothing is
-    /// appended, which the rest of that line would make unreadable: all that is known is written anew instead, until that succeeds.
+    /// If the file cannot be written, the workers go on: only a successor would not know of them. After a failed line nothing is appended, because a partial
+    /// line would make the next one unreadable: instead the whole file is rewritten, until that succeeds.
     fn append(&mut self, line: &Line) {
         self.lines += 1;
         let written = if self.unwritten || self.lines > self.known() * 2 + MOST_OLD_LINES {
@@ -247,7 +246,7 @@ impl Roster {
         self.there.len() + self.starting.len() + self.motions.len()
     }
 
-    /// Beside the old one, so that there is always a whole one.
+    /// Written beside the old file, so that there is always a complete one.
     fn write_anew(&mut self) -> io::Result<()> {
         let next = self.path.with_extension("new");
         let mut file = File::create(&next)?;
@@ -272,11 +271,11 @@ fn write(file: &mut File, line: &Line) -> io::Result<()> {
     file.write_all(text.as_bytes())
 }
 
-/// The workers that were there, those that were being started, and the motions.
+/// The running workers, those that were being started, and the motions.
 type Known = (BTreeMap<String, Entry>, BTreeMap<String, Intent>, BTreeMap<String, u64>);
 
-/// A line that cannot be read, as one that was cut off by the end of its writer, says nothing. A worker that moves something may have moved it also where no line says
-/// so: an older version wrote none, and a session of another caller may have offered a worker that this host had not offered yet.
+/// Lines that cannot be read, such as one that was cut off when its writer ended, are ignored. A worker that moves something may have moved it even where no
+/// line says so: older versions recorded no motions, and another caller's session may have offered a worker that this host had not offered yet.
 fn read(path: &Path) -> io::Result<Known> {
     let bytes = match std::fs::read(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Vec::new(),
@@ -313,7 +312,7 @@ fn read(path: &Path) -> io::Result<Known> {
     Ok((there, starting, motions))
 }
 
-/// The lines that can be read. A line may be cut off inside a character.
+/// The readable lines. A line may be cut off inside a character.
 fn readable(bytes: &[u8], path: &Path) -> impl Iterator<Item = Line> {
     let lines = bytes.split(|byte| *byte == b'\n').enumerate().filter(|(_, line)| !line.is_empty());
     lines.filter_map(|(i, line)| {
@@ -448,7 +447,7 @@ mod tests {
         let motions = Motions::from([("arm".to_owned(), Duration::from_secs(6))]);
         let (mut roster, _) = Roster::take(&directory).unwrap();
         roster.file = File::options().write(true).open("/dev/full").unwrap();
-        // Nor can it be written anew.
+        // It cannot be rewritten either.
         let obstacle = directory.path().join("workers.new");
         std::fs::create_dir(&obstacle).unwrap();
         assert!(!roster.keep_motions(&motions));

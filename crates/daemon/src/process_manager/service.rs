@@ -1,4 +1,4 @@
-//! gRPC in front of the actor.
+//! The gRPC service in front of the actor.
 
 use super::actor::{Handle, Message};
 use super::log_file::{LogReader, log_file};
@@ -20,7 +20,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Request, Response, Status};
 
-/// Logs that are read at the same time.
+/// Maximum number of logs that are read at the same time.
 const MAX_LOG_READERS: usize = 64;
 
 /// The service; clones share the actor.
@@ -142,7 +142,7 @@ impl v1::process_service_server::ProcessService for Service {
             let message = "too many clients read logs already";
             return Err(retry_later(Code::ResourceExhausted, "TOO_MANY", message, Duration::from_secs(1)));
         };
-        // An id is a file's name here.
+        // The id becomes part of a file name.
         let reader = (!id.contains('/')).then(|| LogReader::open(&log_file(&self.directory, &id)).ok()).flatten();
         let Some(reader) = reader else {
             let message = format!("there is no log of a worker `{id}`; the logs of the last that ended are kept");

@@ -1,6 +1,6 @@
-//! The id of the session of a runtime directory's process manager, in a file: a successor of one that was killed goes on with the session, so
-//! that leases of workers that it adopts hold. Where the id is another caller's, another one takes its place. Where that one cannot be written
-//! down, it is used all the same: a successor finds the id of before, which is another caller's still, and goes on with a third one.
+//! The session id of a runtime directory's process manager, in a file: the successor of a killed process manager continues the session, so
+//! that leases of adopted workers stay valid. An id that turns out to be another caller's is replaced. If the new id cannot be written, it is
+//! used all the same: a successor finds the old id, which is still another caller's, and makes a third one.
 
 use super::ROLE;
 use ratn_worker::client::fresh_id;
@@ -19,7 +19,7 @@ impl SessionFile {
         SessionFile { file: directory.path().join("process-manager.session") }
     }
 
-    /// The id; a new one where there is none.
+    /// The id; creates one where there is none.
     pub(super) fn id(&self) -> io::Result<String> {
         match std::fs::read_to_string(&self.file) {
             Ok(known) if !known.trim().is_empty() => Ok(known.trim().to_owned()),
@@ -30,7 +30,7 @@ impl SessionFile {
         }
     }
 
-    /// Another id, and whether it is on the disk.
+    /// Makes another id; also returns whether it is on the disk.
     pub(super) fn renew(&self) -> (String, io::Result<()>) {
         let fresh = fresh_id(ROLE);
         let written = self.write(&fresh);
@@ -74,7 +74,7 @@ mod tests {
         let directory = RuntimeDirectory::create(place.path().join("run")).unwrap();
         let file = SessionFile::of(&directory);
         let first = file.id().unwrap();
-        // Where its new content would be written.
+        // A directory blocks the place of the new file.
         std::fs::create_dir(directory.path().join("process-manager.session.new")).unwrap();
         let (second, written) = file.renew();
         assert!(written.is_err() && second != first);

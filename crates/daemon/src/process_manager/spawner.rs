@@ -1,8 +1,8 @@
-//! Starts processes, all from one thread that lives as long as the process manager, and watches each until its end.
+//! Starts processes, all from one thread that lives as long as the process manager, and watches each until it ends.
 //!
-//! Each worker leads a process group of its own, so that it can be ended with all that it started; what leaves that group is found by
-//! [`super::tracking`]. Its standard input is a
-//! pipe that nobody writes to: it ends with the process manager, however that ends. Nothing runs in the child before exec.
+//! Each worker leads its own process group, so that it can be ended with all processes that it started; [`super::tracking`] finds
+//! processes that leave the group. Its standard input is a pipe that nobody writes to and that closes when the process manager ends,
+//! in whatever way. No code of ours runs in the child before exec.
 
 use super::account::Account;
 use super::limits::{AppliedLimits, Groups, Limits};
@@ -27,11 +27,11 @@ use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 use tokio_util::task::AbortOnDropHandle;
 
-/// Processes that wait to be started.
+/// Capacity for processes that wait to be started.
 const QUEUE: usize = 1_024;
-/// How long the end of a dead worker's output is waited for: something that it started may hold the pipe open.
+/// How long to wait for the end of a dead worker's output: a process that it started may hold the pipe open.
 const LAST_WORDS_PATIENCE: Duration = Duration::from_millis(20);
-/// A part of this process, for the log.
+/// The name of this part of the process in its log.
 const WATCH_OF_WORKER: &str = "the watch of a worker";
 
 /// A process to be started.
@@ -48,15 +48,15 @@ pub(super) struct Job {
     pub(super) limits: Limits,
     /// The directories in which cgroups are made.
     pub(super) groups: Groups,
-    /// A line of its standard output that shows that it is ready.
+    /// A line of its standard output that marks it as ready.
     pub(super) awaited: Option<Awaited>,
     pub(super) log: PathBuf,
     pub(super) max_log_bytes: u64,
-    /// The process is to outlive this one: it writes its log by itself.
+    /// The process is to outlive this one, so it writes its log by itself.
     pub(super) outlives: bool,
 }
 
-/// What becomes of a job: `Spawned`, then `Exited`.
+/// Results of a job: `Spawned`, then `Exited`.
 #[derive(Debug)]
 pub(super) enum Outcome {
     /// The process has been started.
@@ -119,7 +119,7 @@ pub(super) fn start(outcomes: mpsc::Sender<Outcome>, tracker: Tracker) -> io::Re
     Ok(sender)
 }
 
-/// Signals a worker and all that it started.
+/// Signals a worker and its process group.
 pub(super) fn signal(pid: u32, signal: Signal) {
     let Some(group) = i32::try_from(pid).ok().filter(|pid| *pid > 1) else { return };
     match killpg(Pid::from_raw(group), signal) {
@@ -139,7 +139,7 @@ fn spawn(job: &Job) -> io::Result<(Child, Log)> {
         command.current_dir(directory);
     }
     if let Some(account) = &job.account {
-        // With it go the supplementary groups.
+        // This also drops the supplementary groups.
         command.uid(account.uid.as_raw()).gid(account.gid.as_raw());
     }
     if job.outlives {
@@ -165,7 +165,7 @@ struct Watched {
     log: Log,
     awaited: Option<Awaited>,
     force: AppliedLimits,
-    /// The process writes its log by itself; the log is kept bounded from here.
+    /// The process writes its log by itself; this process keeps the log bounded.
     bounds: bool,
 }
 
@@ -196,7 +196,7 @@ async fn watch(worker: Watched, tracker: Tracker, outcomes: mpsc::Sender<Outcome
     let _ = outcomes.send(Outcome::Exited { id, reason, last_words: log.last_words() }).await;
 }
 
-/// Watches a worker that was taken over until its end. Only a parent is told the exit status, so the reason is not known.
+/// Watches an adopted worker until its end. Only a parent learns the exit status, so the reason is unknown.
 pub(super) fn watch_adopted(
     adopted: Adopted,
     log: &Path,
@@ -221,7 +221,7 @@ pub(super) fn watch_adopted(
     tokio::spawn(exit_on_panic(WATCH_OF_WORKER, watching));
 }
 
-/// Ends what is left in the cgroups of a worker, and what the worker had started outside of them.
+/// Ends the processes left in the cgroups of a worker, and those that the worker started outside of them.
 async fn end_rest(id: &str, force: AppliedLimits, tracker: Tracker) {
     let of = id.to_owned();
     let end_rest = move || {

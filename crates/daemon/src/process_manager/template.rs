@@ -1,4 +1,4 @@
-//! A pool of equal workers, as the config has it: what is run, how many, and how it is watched and ended.
+//! A pool of equal workers in the config: what to run, how many, and how they are watched and ended.
 
 use super::account::Account;
 use super::config::check_name;
@@ -15,9 +15,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// The resource manager waits no longer for standstill.
+/// Maximum standstill time that the resource manager waits for.
 const LONGEST_STANDSTILL_MS: u64 = 60_000;
-/// A pool has at most so many workers.
+/// Maximum number of workers in a pool.
 const MAX_WORKERS: u32 = 1_000;
 
 /// A pool of equal workers.
@@ -26,112 +26,112 @@ const MAX_WORKERS: u32 = 1_000;
 pub struct Template {
     /// Its name, the beginning of every worker's id.
     pub name: String,
-    /// The kind of resource that a worker is, `PathPlanner`; its class is process.
+    /// The kind of resource of its workers, such as `PathPlanner`; its class is process.
     pub kind: String,
-    /// What to run; without it, this program.
+    /// The program to run; without it, this program.
     #[serde(default)]
     pub program: Option<PathBuf>,
-    /// A worker in Python, in place of `program`: the script, from the folder of the config. It gets `--id {id} --endpoint-file {endpoint_file}
+    /// A Python script to run in place of `program`, relative to the folder of the config. It gets `--id {id} --endpoint-file {endpoint_file}
     /// --kind {kind}` before `args`.
     #[serde(default)]
     pub python: Option<PathBuf>,
-    /// What runs the script; unless given the virtual environment (`.venv`, `venv`) beside it or in a folder above, then the one that the
-    /// process manager was started in, then `python3`.
+    /// The interpreter of the script; by default that of the virtual environment (`.venv`, `venv`) beside the script or in a folder above, else
+    /// of the environment in which the process manager was started, else `python3`.
     #[serde(default)]
     pub interpreter: Option<PathBuf>,
-    /// Its arguments. `{id}`, `{kind}`, `{host}`, `{runtime_dir}`, `{endpoint_file}` and the names of `parameters` are filled in.
-    /// The worker writes where it serves to `{endpoint_file}`, which is `{runtime_dir}/{id}.endpoint`; its standard input is a
-    /// pipe that ends with the process manager.
+    /// Its arguments. `{id}`, `{kind}`, `{host}`, `{runtime_dir}`, `{endpoint_file}` and the names of `parameters` are substituted. The worker
+    /// writes its endpoint to `{endpoint_file}`, which is `{runtime_dir}/{id}.endpoint`; its standard input is a pipe that closes when the
+    /// process manager ends.
     #[serde(default)]
     pub args: Vec<String>,
-    /// What else is filled in, by name.
+    /// Further values to substitute, by name.
     #[serde(default)]
     pub parameters: BTreeMap<String, Parameter>,
-    /// Environment variables, filled in likewise. Of the process manager's own it gets what programs need to run at all (`PATH`,
-    /// `HOME`, `LANG`, `TZ` and the like) and whatever begins with `RATN_`.
+    /// Environment variables, with the same substitutions. From the process manager's own environment the worker gets what programs need to run
+    /// at all (`PATH`, `HOME`, `LANG`, `TZ` and the like) and every variable that begins with `RATN_`.
     #[serde(default)]
     pub env: BTreeMap<String, String>,
-    /// Variables of the process manager's own environment that it gets, too.
+    /// Further variables of the process manager's own environment that the worker gets.
     #[serde(default)]
     pub pass_env: Vec<String>,
-    /// Where it runs; without it, where the process manager does.
+    /// Its working directory; by default the process manager's.
     #[serde(default)]
     pub directory: Option<PathBuf>,
-    /// The user that it runs as, without supplementary groups; only root may say another one than its own.
+    /// The user that it runs as, without supplementary groups; only root may name another user than its own.
     #[serde(default)]
     pub user: Option<String>,
-    /// What it may use of the machine.
+    /// Its resource limits.
     #[serde(default)]
     pub limits: Limits,
-    /// What of the machine has to be free for one more than `min`; another host is asked where it is not.
+    /// What has to be free on the machine for each worker beyond `min`; otherwise another host is asked.
     #[serde(default)]
     pub needs: Needs,
-    /// For workers that move something: when a lease of one has ended otherwise than by its holder's release, the next one is granted
-    /// after so long, in milliseconds. Such a worker does not start without it.
+    /// For workers that move something: how long the next grant waits after a lease that ended otherwise than by its holder's release, in
+    /// milliseconds. Such a worker does not start without it.
     #[serde(default)]
     pub standstill_ms: Option<u64>,
-    /// When it is ready.
+    /// How it shows that it is ready.
     #[serde(default)]
     pub readiness: Readiness,
-    /// Templates of which a worker has to be ready before the first of this one is started.
+    /// Templates that need a ready worker before the first worker of this one is started.
     #[serde(default)]
     pub after: Vec<String>,
-    /// At least so many workers are kept.
+    /// Minimum number of workers.
     #[serde(default = "one")]
     pub min: u32,
-    /// At most so many workers are started; without it `min`, but at least one.
+    /// Maximum number of workers; by default `min`, but at least one.
     #[serde(default)]
     pub max: Option<u32>,
-    /// So many more are kept ready beside those that are held (and beside `min`).
+    /// Number of workers kept ready in addition to held ones (and to `min`).
     #[serde(default)]
     pub spares: u32,
-    /// A worker beyond what is kept ends when nobody has held it for this long, in seconds.
+    /// A worker beyond the kept number ends when nobody has held it for this long, in seconds.
     #[serde(default = "minute")]
     pub idle_s: f64,
     /// A worker that is not ready after this long has failed, in seconds.
     #[serde(default = "ten")]
     pub start_timeout_s: f64,
-    /// How a worker that serves is seen to hang.
+    /// Health checks that detect a hung worker.
     #[serde(default)]
     pub liveness: Liveness,
-    /// A worker that is to stop while it is held is given this long to be released, in seconds; then its holder loses it.
+    /// Time for a held worker that is to stop to be released, in seconds; then its holder loses it.
     #[serde(default = "half_a_minute")]
     pub drain_s: f64,
-    /// Whether workers outlive a process manager that was killed, for a successor to adopt them. Else they end with it.
+    /// Whether workers outlive a process manager that was killed, for a successor to adopt them. Otherwise they end with it.
     #[serde(default)]
     pub adopt: bool,
     /// A worker that nobody has adopted after this long ends, in seconds.
     #[serde(default = "ten")]
     pub adopt_grace_s: f64,
-    /// A worker that moves nothing ends itself, for another one to be started, when a goal that was told to stop still runs this long behind the
-    /// 3 s that it has for that, in seconds; 0: never.
+    /// A worker that moves nothing ends itself, to be replaced, when a cancelled goal still runs this long after the 3 s that it has to stop, in
+    /// seconds; 0: never.
     #[serde(default = "minute")]
     pub stuck_timeout_s: f64,
     /// A worker that has not ended this long after SIGTERM is killed, in seconds.
     #[serde(default = "two")]
     pub stop_timeout_s: f64,
-    /// A first crash is followed by a new start at once, a second one after this long, each further one after twice as
-    /// long, in milliseconds.
+    /// Delay before the restart after a second crash in a row, in milliseconds; a first crash is followed by a restart at once, each further one
+    /// by twice the delay, …
     #[serde(default = "backoff")]
     pub backoff_ms: u64,
-    /// … up to this, in milliseconds.
+    /// … up to this delay, in milliseconds.
     #[serde(default = "max_backoff")]
     pub max_backoff_ms: u64,
-    /// A worker that served this long was not part of a crash loop, in seconds.
+    /// A worker that served this long before its crash was not in a crash loop, in seconds.
     #[serde(default = "ten")]
     pub stable_s: f64,
-    /// After so many crashes in a row the pool has failed: nothing is started until somebody asks for it.
+    /// After this many crashes in a row the pool has failed: nothing is started until a client asks for workers.
     #[serde(default = "crash_limit")]
     pub crash_limit: u32,
 }
 
-/// How a worker that serves is seen to hang: it is asked for its health, and killed and replaced when it does not answer in time.
+/// Health checks of serving workers: a worker that does not answer in time is killed and replaced.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Liveness {
-    /// The pause between an answer and the next question, in seconds.
+    /// Pause between an answer and the next check, in seconds.
     pub interval_s: f64,
-    /// How long an answer may take, in seconds.
+    /// Timeout of an answer, in seconds.
     pub timeout_s: f64,
 }
 
@@ -141,18 +141,18 @@ impl Default for Liveness {
     }
 }
 
-/// What of the machine has to be free for one more worker. All keys are optional.
+/// What has to be free on the machine for one more worker. All keys are optional.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Needs {
     /// Memory, in MiB.
     pub free_memory_mib: Option<u64>,
-    /// Processors that do nothing.
+    /// Number of idle processors.
     pub idle_cores: Option<f64>,
 }
 
 impl Needs {
-    /// How many more there is room for; nothing where it needs nothing.
+    /// How many more workers there is room for; `None` where they need nothing.
     pub(crate) fn room(&self, sample: &Sample) -> Option<u32> {
         let fits = |free: f64, of_one: f64| (free / of_one).floor().clamp(0.0, f64::from(MAX_WORKERS)) as u32;
         let memory = self.free_memory_mib.map(|mib| fits((sample.free_memory_bytes >> 20) as f64, mib as f64));
@@ -182,14 +182,14 @@ impl Liveness {
 }
 
 impl Template {
-    /// What is run, for messages.
+    /// The command line, for messages.
     pub(super) fn command_line(&self) -> String {
         let (program, args) = self.invocation();
         let program = program.map_or_else(|| "ratn".to_owned(), |program| program.display().to_string());
         std::iter::once(program).chain(args).collect::<Vec<_>>().join(" ")
     }
 
-    /// What to run (this program, where none is named) with which arguments, in which nothing is filled in yet.
+    /// The program (`None` for this program) and its arguments, before substitution.
     pub(super) fn invocation(&self) -> (Option<PathBuf>, Vec<String>) {
         match &self.python {
             None => (self.program.clone(), self.args.clone()),
@@ -202,7 +202,7 @@ impl Template {
         Interpreter::of(script, self.interpreter.as_deref(), active.as_deref(), Path::is_file)
     }
 
-    /// With the paths of a config as they are from the folder that it is in.
+    /// Makes relative paths absolute, from the config's folder.
     pub fn settle(&mut self, folder: &Path) {
         if let Some(script) = self.python.as_mut().filter(|script| script.is_relative()) {
             let from_here = folder.join(&*script);
@@ -247,7 +247,7 @@ impl Template {
         }
     }
 
-    /// At most so many workers.
+    /// Maximum number of workers.
     pub fn max_workers(&self) -> u32 {
         self.max.unwrap_or(self.min.max(1))
     }
@@ -268,12 +268,12 @@ impl Template {
         Duration::from_secs_f64(self.stop_timeout_s)
     }
 
-    /// What a worker moves stands still so long after its lease has ended; nothing for one that moves nothing.
+    /// How long a worker's device may go on moving after its lease has ended; `None` for a worker without one.
     pub(crate) fn standstill(&self) -> Option<Duration> {
         self.standstill_ms.map(Duration::from_millis)
     }
 
-    /// How long a worker's goal that was told to stop may run on; nothing where that is for ever, as of what moves.
+    /// How long a worker's cancelled goal may run on; `None` for no limit, as for workers that move something.
     pub(crate) fn stuck_timeout(&self) -> Option<Duration> {
         let is_ended = self.stuck_timeout_s > 0.0 && self.standstill_ms.is_none();
         is_ended.then(|| Duration::from_secs_f64(self.stuck_timeout_s))
@@ -283,12 +283,12 @@ impl Template {
         Duration::from_secs_f64(self.stable_s)
     }
 
-    /// Whether there may be more of it because others wait for what is held. Not of what moves something: there is one robot.
+    /// Whether the pool may grow because requests wait for held workers. Not for workers that move something: there is only one robot.
     pub(crate) fn grows_with_the_queue(&self) -> bool {
         self.standstill_ms.is_none() && self.max_workers() > 1
     }
 
-    /// Whether a worker of this one is started as one of `other` is: how many there are and what follows a crash does not count.
+    /// Whether its workers are started in the same way as those of `other`: their number and the restart policy do not count.
     pub(crate) fn starts_the_same_as(&self, other: &Template) -> bool {
         let of_the_process = |template: &Template| Template {
             name: String::new(),
@@ -313,7 +313,7 @@ impl Template {
         of_the_process(self) == of_the_process(other)
     }
 
-    /// What is missing on this machine for a worker to be started, in words.
+    /// What is missing on this machine to start a worker, for people.
     pub fn obstacle(&self) -> Option<String> {
         if let Some(directory) = self.directory.as_ref().filter(|directory| !directory.is_dir()) {
             return Some(format!("there is no directory {}", directory.display()));
@@ -331,13 +331,13 @@ impl Template {
         not_there(self.program.as_ref()?)
     }
 
-    /// What runs a worker in Python, and why that, for people.
+    /// The interpreter of a Python worker and why it was chosen, for people.
     pub fn interpreter(&self) -> Option<String> {
         let Interpreter { program, because } = self.interpreter_of(self.python.as_deref()?);
         Some(format!("{} runs it ({because})", program.display()))
     }
 
-    /// Says what is wrong with it; `at` is its place in the config.
+    /// Reports what is wrong with it; `at` is its place in the config.
     pub(super) fn check(&self, at: &str) -> Result<(), ConfigError> {
         let key = |name: &str| format!("{at}.{name}");
         check_name(&key("name"), &self.name)?;

@@ -3,9 +3,9 @@
 use ratn_proto::types::PoolStatus;
 use sysinfo::{Pid, ProcessRefreshKind, ProcessesToUpdate, System};
 
-/// Remembers the last look, from which processor use is counted.
+/// Keeps the last measurement, from which processor use is computed.
 pub(super) struct Usage {
-    /// None where the system does not say.
+    /// `None` where the system does not provide it.
     system: Option<System>,
 }
 
@@ -19,13 +19,13 @@ impl Usage {
         let workers = || pools.iter().flat_map(|pool| &pool.workers).filter(|worker| worker.pid != 0);
         let pids: Vec<Pid> = workers().map(|worker| Pid::from_u32(worker.pid)).collect();
         let what = ProcessRefreshKind::nothing().with_memory().with_cpu();
-        // What is not known stays at 0.
+        // Unknown values stay 0.
         let _ = system.refresh_processes_specifics(ProcessesToUpdate::Some(&pids), true, what);
         for worker in pools.iter_mut().flat_map(|pool| &mut pool.workers) {
             if let Some(process) = system.process(Pid::from_u32(worker.pid)) {
                 worker.resident_bytes = process.memory();
                 worker.age_s = process.run_time();
-                // Percent of one core, as tenths of a percent.
+                // Converts percent of a core to thousandths of a core.
                 worker.cpu_millicores = (process.cpu_usage() * 10.0).round() as u32;
             }
         }

@@ -6,12 +6,12 @@ use std::collections::{BTreeMap, VecDeque};
 
 #[derive(Debug, Default)]
 pub(super) struct Withheld {
-    /// By the id of the worker.
+    /// By worker id.
     offers: BTreeMap<String, Command>,
 }
 
 impl Withheld {
-    /// The commands to perform now, in order: those that were held back first, where what may move is `kept` for a successor.
+    /// The commands to perform now, in order: the held-back ones first, where motions are `kept` for a successor.
     pub(super) fn pass(&mut self, commands: Vec<Command>, kept: bool) -> VecDeque<Command> {
         if kept {
             return std::mem::take(&mut self.offers).into_values().chain(commands).collect();

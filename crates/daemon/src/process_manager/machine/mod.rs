@@ -1,5 +1,5 @@
-//! This machine as resources of the class system (the paper's Section V-B): its processors, memory, disk, load and battery, created when
-//! the process manager starts and kept up to date, so that a task can require them; and room for workers.
+//! This machine as resources of the class system (the paper's Section V-B): its processors, memory, disk, load and battery, created when the
+//! process manager starts and kept up to date, so that a task can require them; and whether there is room for more workers.
 //!
 //! ```text
 //!   sample.rs (sysinfo, statvfs, /sys) ──Sample──▶ DeadbandFilter (what was published, and what has changed enough) ──▶ offered resources
@@ -21,17 +21,17 @@ use serde::{Deserialize, Serialize};
 use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 
-/// What of this machine is offered. All keys are optional.
+/// The part of this machine that is offered. All keys are optional.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MachineConfig {
-    /// The pause between two looks, in seconds.
+    /// Interval of measurements, in seconds.
     pub interval_s: f64,
-    /// So many processors are not offered as `Core`: what the daemons and everybody else need.
+    /// Number of processors that are not offered as `Core`: those for the daemons and all other programs.
     pub reserved_cores: u32,
-    /// Whether the battery that the kernel knows is offered as `Battery`, where there is one.
+    /// Whether the machine's battery, where there is one, is offered as `Battery`.
     pub battery: bool,
-    /// A value is published again when it has changed by this share of what there can be.
+    /// A value is published again when it has changed by this fraction of its maximum.
     pub step: f64,
 }
 
@@ -61,7 +61,7 @@ impl DeadbandFilter {
         DeadbandFilter { step, sample: None }
     }
 
-    /// What is to be published now: the sample with the old value of everything that has not changed enough; nothing where that is all.
+    /// The sample to publish now, with the old value of everything that has not changed enough; `None` where nothing has.
     pub(super) fn pass(&mut self, now: &Sample) -> Option<Sample> {
         let Some(published) = &self.sample else {
             self.sample = Some(now.clone());
@@ -93,21 +93,22 @@ impl DeadbandFilter {
     }
 }
 
-/// At least a step apart; so that nothing is lost at the ends, where there can be no step more, exactly nothing and exactly all are published.
+/// Whether two values are at least a step apart. Exactly zero and exactly all are always published, because near the ends there is no room for
+/// a whole step.
 fn far(was: f64, is: f64, step: f64) -> bool {
     (was - is).abs() >= step || (is == 0.0 && was != 0.0)
 }
 
-/// What is offered of this machine.
+/// The machine as it is offered.
 pub(super) struct Machine {
     pub(super) config: MachineConfig,
     pub(super) labels: Labels,
-    /// The host without what changes.
+    /// The host's resource without measurements.
     pub(super) host: Resource,
 }
 
 impl Machine {
-    /// Keeps what is offered up to date, and tells the pools of every look. Does not end.
+    /// Keeps the offered resources up to date, and sends every measurement to the pools. Never returns.
     pub(super) async fn watch(
         self,
         directory: RuntimeDirectory,

@@ -1,42 +1,42 @@
-//! One look at the machine.
+//! One measurement of the machine.
 
 use nix::sys::statvfs::statvfs;
 use std::fs;
 use std::path::{Path, PathBuf};
 use sysinfo::{MemoryRefreshKind, System};
 
-/// Where the kernel shows batteries.
+/// Directory in which the kernel lists batteries.
 const POWER_SUPPLIES: &str = "/sys/class/power_supply";
 
-/// What there is, and what of it is free now.
+/// Capacities of the machine, and what is free now.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
-    /// Processors.
+    /// Number of processors.
     pub cores: u32,
-    /// Those that run or want to, of the last minute, for each processor.
+    /// Load average of the last minute, per processor.
     pub load_per_core: f64,
-    /// Processors that did nothing since the last look.
+    /// Processors that were idle since the last measurement.
     pub idle_cores: f64,
-    /// Memory.
+    /// Memory in bytes.
     pub memory_bytes: u64,
-    /// What of it programs can have.
+    /// Memory that is available to programs.
     pub free_memory_bytes: u64,
-    /// The disk of the runtime directory.
+    /// Size of the disk with the runtime directory.
     pub disk_bytes: u64,
-    /// What of it this user can have.
+    /// Disk space that is available to this user.
     pub free_disk_bytes: u64,
-    /// The charge of the battery, 0 to 1, where there is one and it is asked for.
+    /// Charge of the battery, 0 to 1, where there is one and it is wanted.
     pub battery: Option<f64>,
 }
 
-/// Remembers the last look, from which what is idle is counted.
+/// Keeps the last measurement, from which idle time is computed.
 #[derive(Debug)]
 pub(super) struct Sampler {
-    /// None where the system does not say.
+    /// `None` where the system does not provide it.
     system: Option<System>,
     disk: PathBuf,
     battery: bool,
-    /// Time of all processors, in ticks: idle, and in all.
+    /// Time of all processors, in ticks: idle, and total.
     ticks: (u64, u64),
 }
 
@@ -72,7 +72,8 @@ impl Sampler {
     }
 }
 
-/// `proc_stat(5)`: the fourth and the fifth number (idle, and waiting for a disk), and the sum of the first eight.
+/// The first line of `proc_stat(5)`: idle time (fourth and fifth number: idle, and waiting for a disk) and total
+/// time (sum of the first eight).
 fn ticks() -> Option<(u64, u64)> {
     let text = fs::read_to_string("/proc/stat").ok()?;
     let numbers: Vec<u64> =

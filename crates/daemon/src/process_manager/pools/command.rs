@@ -4,63 +4,63 @@ use crate::process_manager::machine::Sample;
 use ratn_proto::types::{Demand, WorkerStatus};
 use std::time::Duration;
 
-/// What has happened.
+/// An event of the pools.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Event {
     /// Time has passed. The first one starts every pool.
     Time,
-    /// A worker's process is there.
+    /// A worker's process was started.
     Spawned {
         /// The worker's id.
         id: String,
-        /// Its process id, also that of its group.
+        /// Its process id, which is also the id of its process group.
         pid: u32,
-        /// What it may use of the machine, for people.
+        /// Its resource limits, for people.
         limits: String,
     },
     /// A worker's health is SERVING.
     Serving {
         /// The worker's id.
         id: String,
-        /// Where.
+        /// Its endpoint.
         endpoint: String,
     },
-    /// The resource manager has the worker's resource.
+    /// The resource manager has accepted the worker's resource.
     Offered {
         /// The worker's id.
         id: String,
     },
-    /// The resource manager does not take the worker's resource, or not yet.
+    /// The resource manager has not accepted the worker's resource, or not yet.
     Refused {
         /// The worker's id.
         id: String,
-        /// Its words.
+        /// The resource manager's reason.
         why: String,
     },
-    /// A worker's process is gone, or could not be started.
+    /// A worker's process has ended, or could not be started.
     Exited {
         /// The worker's id.
         id: String,
-        /// How, for people.
+        /// How it ended, for people.
         reason: String,
         /// The end of its log; may be empty.
         last_words: String,
     },
-    /// The worker's resource is gone, as it was asked to be with [`Command::Retire`].
+    /// The worker's resource was withdrawn after [`Command::Retire`].
     Withdrawn {
         /// The worker's id.
         id: String,
     },
-    /// The worker's resource is held, so it is not gone.
+    /// The worker's resource is held, so it was not withdrawn.
     Kept {
         /// The worker's id.
         id: String,
     },
-    /// Somebody holds the worker's resource now, or nobody any more.
+    /// The worker's resource is held now, or no longer held.
     Used {
         /// The worker's id.
         id: String,
-        /// Whether somebody does.
+        /// Whether it is held.
         held: bool,
     },
     /// The worker has answered [`Command::Check`].
@@ -68,20 +68,20 @@ pub enum Event {
         /// The worker's id.
         id: String,
     },
-    /// It has not, in time.
+    /// The worker has not answered [`Command::Check`] in time.
     Unanswered {
         /// The worker's id.
         id: String,
-        /// What came instead, for people.
+        /// What happened instead, for people.
         why: String,
     },
-    /// What waits for more than exists, as it is now.
+    /// The present demand for workers that do not exist.
     Demanded(Vec<Demand>),
-    /// What of the machine is free now.
+    /// The present measurements of the machine.
     Looked(Sample),
 }
 
-/// What the shell shall do.
+/// A command to the shell.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Command {
     /// Start a process of a template; answered by [`Event::Spawned`] or [`Event::Exited`].
@@ -107,21 +107,21 @@ pub enum Command {
         worker: WorkerStatus,
         /// The kind of resource that it is.
         kind: String,
-        /// What it moves may go on for so long after its end; nothing for one that moves nothing.
+        /// How long the worker's device may go on moving after the worker's end; `None` for a worker without one.
         standstill: Option<Duration>,
     },
-    /// Withdraw the worker's resource; who holds it loses it.
+    /// Withdraw the worker's resource; its holder loses it.
     Withdraw {
         /// The worker's id.
         id: String,
     },
-    /// Withdraw the worker's resource as soon as nobody holds it; answered by [`Event::Withdrawn`] or [`Event::Kept`], after which it
-    /// is tried again until [`Command::Keep`].
+    /// Withdraw the worker's resource as soon as nobody holds it; answered by [`Event::Withdrawn`] or by [`Event::Kept`]. After the
+    /// latter the withdrawal is tried again until [`Command::Keep`].
     Retire {
         /// The worker's id.
         id: String,
     },
-    /// Do not try to withdraw it any more.
+    /// Stop trying to withdraw the resource.
     Keep {
         /// The worker's id.
         id: String,
@@ -130,28 +130,28 @@ pub enum Command {
     Check {
         /// The worker's id.
         id: String,
-        /// How long it has for its answer.
+        /// Time for the answer.
         within: Duration,
     },
-    /// Notify those who watch the workers.
+    /// Notify watchers of this worker.
     Notify(WorkerStatus),
 }
 
-/// A request that is refused.
+/// Why a request is refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PoolError {
-    /// No such template in the config.
+    /// The config has no such template.
     #[error("there is no template `{template}`; the config has {known}")]
     UnknownTemplate {
-        /// What was asked for.
+        /// The requested name.
         template: String,
-        /// Those there are.
+        /// The templates of the config.
         known: String,
     },
     /// No such worker.
     #[error("there is no worker `{id}`")]
     UnknownWorker {
-        /// Which.
+        /// Its id.
         id: String,
     },
     /// The pool would have more than its maximum.
@@ -159,11 +159,11 @@ pub enum PoolError {
     TooMany {
         /// The template.
         template: String,
-        /// How many there are to be already.
+        /// The number of workers that are wanted already.
         wanted: u32,
         /// The template's maximum.
         max: u32,
-        /// How many were asked for.
+        /// The number of workers that were requested in addition.
         count: u32,
     },
     /// The config does not allow a pool of this size.
@@ -171,13 +171,13 @@ pub enum PoolError {
     Size {
         /// The template.
         template: String,
-        /// Which rule is broken.
+        /// The rule that is broken.
         why: String,
     },
     /// The host takes no new work.
     #[error("the host `{host}` is drained: `ratn drain --undo {host}` lets it take work again")]
     Drained {
-        /// Which.
+        /// The host's name.
         host: String,
     },
     /// The process manager is ending.

@@ -6,16 +6,16 @@ use ratn_model::value::Value;
 use ratn_proto::types::Demand;
 use std::borrow::Cow;
 
-/// How many workers of a kind there should be, those that are there included. 0 for none.
+/// How many workers of a kind there should be, existing ones included. 0 for no demand.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Demanded {
-    /// For those who wait for more than exists.
+    /// For requests that wait for more than exists.
     pub(super) missing: u32,
-    /// For those who have waited for long for what is held, as well.
+    /// Also for requests that have long waited for workers that are held.
     pub(super) queued: u32,
 }
 
-/// How many workers of a kind there should be on `host` for all of `demands`.
+/// How many workers of a kind there should be on `host` to meet all `demands`.
 pub(super) fn demanded(demands: &[Demand], kind: &str, (host, labels): (&str, &Labels)) -> Demanded {
     let host = Value::String(host.to_owned());
     let of_workers = |name: &str| match name {

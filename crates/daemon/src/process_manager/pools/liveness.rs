@@ -1,23 +1,23 @@
-//! When a worker that serves is asked whether it still does. One question at a time; the next one a while after the answer, together with
-//! others that are due about then: a thousand workers are asked in some turns a second, not one by one.
+//! When a serving worker gets a health check. There is one check at a time; the next follows a while after the answer, together with
+//! other checks that are due at about the same time: a thousand workers are checked in a few batches per second, not one by one.
 
 use crate::process_manager::template::Template;
 use ratn_model::time::Timestamp;
 use std::time::Duration;
 
-/// Questions are asked at multiples of this,
+/// Checks are made at multiples of this time,
 const TURN: Duration = Duration::from_millis(100);
-/// or of this part of the pause, where that is less.
+/// or of this fraction of the interval, where that is shorter.
 const TURNS_PER_PAUSE: u32 = 20;
 
 /// See the module.
 #[derive(Debug)]
 pub(super) struct Liveness {
-    /// `None` where it cannot be asked.
+    /// Interval between checks; `None` where the worker cannot be asked.
     pause: Option<Duration>,
-    /// The time for an answer.
+    /// Timeout of an answer.
     within: Duration,
-    /// When to ask; `None` while an answer is awaited, and before it serves.
+    /// When to ask; `None` while an answer is awaited, and before the worker serves.
     next: Option<Timestamp>,
 }
 
@@ -27,17 +27,17 @@ impl Liveness {
         Liveness { pause, within: template.liveness.timeout(), next: None }
     }
 
-    /// How long it has to answer, where it is to be asked now.
+    /// The timeout of a check, where one is due now.
     pub(super) fn ask(&mut self, now: Timestamp) -> Option<Duration> {
         self.next.take_if(|next| *next <= now).map(|_| self.within)
     }
 
-    /// It is to be asked now, where it can be.
+    /// A check is due now, where the worker can be asked.
     pub(super) fn ask_at_once(&mut self, now: Timestamp) {
         self.next = self.pause.map(|_| now);
     }
 
-    /// It serves.
+    /// The worker serves: sets the time of the next check.
     pub(super) fn answered(&mut self, now: Timestamp) {
         self.next = self.pause.map(|pause| turn_after(now + pause, TURN.min(pause / TURNS_PER_PAUSE)));
     }
@@ -81,7 +81,7 @@ mod tests {
             liveness.deadline().unwrap_or_default()
         };
         assert_eq!([asked(2.0, 10.01), asked(2.0, 10.07)], [Timestamp::from_seconds(12.1); 2]);
-        // A short pause stays about as short.
+        // A short interval stays about as short.
         assert_eq!(asked(0.2, 10.001), Timestamp::from_seconds(10.21));
     }
 }

@@ -5,8 +5,8 @@
 //!                                                            ├─ Size      how many there shall be
 //!   Vec<Command> ◀───────────────────────────────────────────┴─ Restarts  what follows a crash
 //! ```
-//! A worker that exits without being asked to is a crash: its resource is withdrawn at once and another worker is started,
-//! at once after a first crash, later after each further one, not at all after [`Template::crash_limit`] in a row.
+//! A worker that exits without being asked to has crashed: its resource is withdrawn at once and another worker is started, at once
+//! after the first crash, with growing delay after further ones, and not at all after [`Template::crash_limit`] crashes in a row.
 
 mod command;
 mod demand;
@@ -31,12 +31,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 use worker::Worker;
 
-/// Who is to be replaced.
+/// The workers to replace.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Restart {
     /// All workers of a template.
     Template(String),
-    /// This one.
+    /// This worker.
     Worker(String),
 }
 
@@ -46,9 +46,9 @@ pub struct Pools {
     host: String,
     labels: Labels,
     pools: BTreeMap<String, Pool>,
-    /// By template: what workers of templates that are gone from the config moved.
+    /// By template: motions of workers whose templates are no longer in the config.
     motions_of_unknown: BTreeMap<String, Motion>,
-    /// It takes no new work.
+    /// The host takes no new work.
     draining: bool,
     ending: bool,
 }
@@ -62,13 +62,13 @@ impl Pools {
         Pools { host, labels: Labels::new(), pools, motions_of_unknown, draining: false, ending: false }
     }
 
-    /// On a host of which this is said.
+    /// Sets the labels of the host.
     #[must_use]
     pub fn with_labels(self, labels: Labels) -> Pools {
         Pools { labels, ..self }
     }
 
-    /// Takes in what has happened; what to do now, in order.
+    /// Handles an event; returns the commands to perform, in order.
     pub fn handle(&mut self, now: Timestamp, event: Event) -> Vec<Command> {
         let mut commands = Vec::new();
         match event {
@@ -123,12 +123,12 @@ impl Pools {
         commands
     }
 
-    /// The next moment at which time alone changes something: [`Event::Time`] is due then.
+    /// When the passing of time changes something next: [`Event::Time`] is due then.
     pub fn next_deadline(&self) -> Option<Timestamp> {
         self.pools.values().filter_map(Pool::deadline).min()
     }
 
-    /// New workers have other ids than these, which a process manager before this one gave away.
+    /// New workers get other ids than these, which an earlier process manager gave away.
     pub fn go_on_after(&mut self, ids: &[String]) {
         for id in ids {
             if let Some((template, number)) = self.parts_of(id)
@@ -139,8 +139,8 @@ impl Pools {
         }
     }
 
-    /// What workers of a process manager before this one moved may still move: by template, for how long. Where a template is gone, each
-    /// one that moves something may be that template under another name.
+    /// Motions of an earlier process manager's workers that may still go on: by template, for how long. Where a template is gone from
+    /// the config, every template that moves something may be the same one under a new name.
     pub fn moved_before(&mut self, now: Timestamp, motions: &BTreeMap<String, Duration>) {
         for (template, bound) in motions {
             if let Some(pool) = self.pools.get_mut(template) {
@@ -153,15 +153,15 @@ impl Pools {
         }
     }
 
-    /// By template: for how long what its workers moved may go on when all of their processes end now. A successor has to wait for that.
+    /// By template: how long its workers' devices may go on moving if all worker processes end now. A successor has to wait for that.
     pub fn motions(&self, now: Timestamp) -> BTreeMap<String, Duration> {
         let of_pools = self.pools.iter().filter_map(|(name, pool)| Some((name, pool.motion(now)?)));
         let of_unknown = self.motions_of_unknown.iter().filter_map(|(name, motion)| Some((name, motion.bound(now)?)));
         of_pools.chain(of_unknown).map(|(name, bound)| (name.clone(), bound)).collect()
     }
 
-    /// Takes over a worker that serves already, of a process manager that is gone, with the bound of what it moves; what to do. Nothing
-    /// where its pool is not known.
+    /// Adopts a serving worker of an earlier process manager, with the bound of its motions; returns the commands. `None` where its pool
+    /// is unknown.
     pub fn adopt(
         &mut self,
         now: Timestamp,
@@ -176,10 +176,10 @@ impl Pools {
         Some(commands)
     }
 
-    /// Starts more workers, also where the pool has failed; their ids, and what to do.
+    /// Starts more workers, also where the pool has failed; returns their ids and the commands.
     ///
     /// # Errors
-    /// An unknown template, more than its maximum, or the end.
+    /// An unknown template, too many workers, a drained host, or the end.
     pub fn spawn(
         &mut self,
         now: Timestamp,
@@ -192,8 +192,8 @@ impl Pools {
         Ok((started, commands))
     }
 
-    /// Ends a worker once nobody holds it, at the latest when its template's time for that is over; it is replaced only where the
-    /// pool would fall below its minimum.
+    /// Ends a worker once nobody holds it, at the latest after its template's drain time; it is replaced only where the pool would fall
+    /// below its minimum.
     ///
     /// # Errors
     /// An unknown worker.
@@ -205,11 +205,11 @@ impl Pools {
         Ok(commands)
     }
 
-    /// Lets other workers take the place of a template's, or of one worker, each once its successor is ready; the ids of those that
-    /// will go, and what to do.
+    /// Replaces one worker or all workers of a template, each once its successor is ready; returns the ids of the workers that will end,
+    /// and the commands.
     ///
     /// # Errors
-    /// Who is not known, a host that is drained, or the end.
+    /// An unknown worker or template, a drained host, or the end.
     pub fn restart(&mut self, now: Timestamp, which: &Restart) -> Result<(Vec<String>, Vec<Command>), PoolError> {
         self.takes_work()?;
         let mut commands = Vec::new();
@@ -226,8 +226,8 @@ impl Pools {
         Ok((going, commands))
     }
 
-    /// Another session offers the workers from now on. Those that were told of the one before, which is another caller's, are of no use:
-    /// every one is ended at once, held or not, and others take their places.
+    /// Another session offers the workers from now on. Workers that know only the old session, which is another caller's, are useless:
+    /// all are ended at once, held or not, and replaced.
     pub fn renew(&mut self, now: Timestamp) -> Vec<Command> {
         let mut commands = Vec::new();
         let takes_work = self.takes_work().is_ok();
@@ -240,7 +240,7 @@ impl Pools {
         commands
     }
 
-    /// Changes how many workers a template has; the pool as it is then.
+    /// Changes the number of workers of a template; returns the changed pool and the commands.
     ///
     /// # Errors
     /// An unknown template, or more than its config allows.
@@ -260,7 +260,7 @@ impl Pools {
         Ok((status, commands))
     }
 
-    /// Starts no worker any more and ends those there are, each once nobody holds it; or takes work again.
+    /// Drains the host: starts no more workers and ends existing ones, each once nobody holds it; or ends the drain.
     pub fn drain(&mut self, now: Timestamp, draining: bool) -> Vec<Command> {
         self.draining = draining;
         let mut commands = Vec::new();
@@ -272,12 +272,12 @@ impl Pools {
         commands
     }
 
-    /// Whether it takes no new work.
+    /// Whether the host is drained.
     pub fn is_draining(&self) -> bool {
         self.draining
     }
 
-    /// Ends every worker, and starts none any more. What has not ended after `patience` is killed.
+    /// Ends every worker, and starts no more. Workers that have not ended after `patience` are killed.
     pub fn shut_down(&mut self, now: Timestamp, patience: Duration) -> Vec<Command> {
         self.ending = true;
         let mut commands = Vec::new();
@@ -285,7 +285,8 @@ impl Pools {
         commands
     }
 
-    /// Of which kinds there can be no more workers for now, and why. Of several templates of a kind the first counts, as for demand.
+    /// The kinds of which there can be no more workers for now, and why. Where several templates have the same kind, the first one
+    /// counts, as for demand.
     pub fn shortages(&self) -> BTreeMap<String, Shortage> {
         let drained = || Shortage { most: 0, reason: format!("the host `{}` is drained", self.host) };
         let shortage = |pool: &Pool| if self.draining { Some(drained()) } else { pool.shortage() };
@@ -301,12 +302,12 @@ impl Pools {
         self.pools.values().all(Pool::is_empty)
     }
 
-    /// Whether there is a worker of that id.
+    /// Whether a worker with this id exists.
     pub fn knows(&mut self, id: &str) -> bool {
         self.find(id).is_some()
     }
 
-    /// Every pool with its workers, the oldest first.
+    /// Every pool with its workers, oldest first.
     pub fn status(&self) -> Vec<PoolStatus> {
         self.pools.values().map(Pool::status).collect()
     }
@@ -334,7 +335,7 @@ impl Pools {
         }
     }
 
-    /// Starts the pools that have been waiting for others, where those have somebody ready now.
+    /// Starts the pools that waited for others, where those have a ready worker now.
     fn let_follow(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
         let ready: BTreeSet<String> =
             self.pools.iter().filter(|(_, pool)| pool.has_ready()).map(|(name, _)| name.clone()).collect();
@@ -347,15 +348,15 @@ impl Pools {
         }
     }
 
-    /// Workers are started for what waits, up to the pool's maximum, also where the pool had failed before anybody asked. When
-    /// nobody waits any more, those that do not serve yet are ended; the others stay.
+    /// Starts workers for the demand, up to the pool's maximum, also where the pool had failed before. When there is no more demand,
+    /// workers that do not serve yet are ended; the others stay.
     fn demanded(&mut self, now: Timestamp, demands: &[Demand], commands: &mut Vec<Command>) {
         if self.ending {
             return;
         }
         let mut taken = BTreeSet::new();
         for pool in self.pools.values_mut() {
-            // Of several templates of a kind the first meets what is asked for.
+            // Where several templates have the same kind, the first one meets the demand.
             let kind = pool.template().kind.clone();
             let demanded = demand::demanded(demands, &kind, (&self.host, &self.labels));
             pool.demanded(now, if taken.insert(kind) { demanded } else { Demanded::default() }, commands);
@@ -368,7 +369,7 @@ impl Pools {
         self.pools.get_mut(template).ok_or(PoolError::UnknownTemplate { template: template.to_owned(), known })
     }
 
-    /// Lets its pool do something about a worker, and then start what is missing. False where the worker is not known.
+    /// Applies `act` to a worker in its pool, and then starts missing workers. False where the worker is unknown.
     fn about(
         &mut self,
         now: Timestamp,
@@ -385,7 +386,7 @@ impl Pools {
         true
     }
 
-    /// Template and number of a worker's id.
+    /// Template and number in a worker's id.
     fn parts_of<'i>(&self, id: &'i str) -> Option<(&'i str, u64)> {
         parts_of(id, &self.host)
     }
@@ -403,12 +404,12 @@ impl Pools {
     }
 }
 
-/// The number of a worker of this template on this host; nothing where the id is another one's.
+/// The number of a worker of this template on this host; `None` where the id belongs to another.
 pub(super) fn number_of(id: &str, template: &str, host: &str) -> Option<u64> {
     parts_of(id, host).filter(|(name, _)| *name == template).map(|(_, number)| number)
 }
 
-/// Template and number of the id of a worker on this host.
+/// Template and number in the id of a worker on this host.
 fn parts_of<'i>(id: &'i str, host: &str) -> Option<(&'i str, u64)> {
     let (name, number) = id.strip_suffix(host)?.strip_suffix('@')?.rsplit_once('-')?;
     Some((name, number.parse().ok()?))

@@ -1,9 +1,10 @@
-//! Devices that may still move although their worker's process has ended. No process can confirm that they stand still, so only time decides.
+//! Devices that may still move although their worker's process has ended. No process can confirm that they stand still, so only waiting
+//! helps.
 
 use ratn_model::time::Timestamp;
 use std::time::Duration;
 
-/// Until when something may move, and the bound from which that follows.
+/// When motion has ended for certain, and the bound from which that follows.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Motion {
     until: Timestamp,
@@ -11,13 +12,13 @@ pub(super) struct Motion {
 }
 
 impl Motion {
-    /// A worker is gone now, and what it moved may go on for so long. What others moved ends no earlier for that.
+    /// A worker has ended now, and its device may go on moving for `bound`. Earlier motions keep their own end.
     pub(super) fn goes_on(&mut self, now: Timestamp, bound: Duration) {
         self.bound = self.bound(now).unwrap_or_default().max(bound);
         self.until = self.until.max(now + bound);
     }
 
-    /// When nothing moves any more.
+    /// When all motion has ended.
     pub(super) fn until(&self) -> Timestamp {
         self.until
     }
@@ -26,7 +27,7 @@ impl Motion {
         self.until <= now
     }
 
-    /// How long somebody has to wait who does not know when it began; nothing where it is over.
+    /// How long a process has to wait that does not know when the motion began; `None` when it is over.
     pub(super) fn bound(&self, now: Timestamp) -> Option<Duration> {
         (!self.is_over(now)).then_some(self.bound)
     }

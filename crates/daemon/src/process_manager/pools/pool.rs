@@ -1,4 +1,4 @@
-//! The workers of one template: as many as its size says, replaced as its restarts allow.
+//! The workers of one template: as many as its size wants, restarted as its restart policy allows.
 
 use super::command::{Command, PoolError};
 use super::demand::Demanded;
@@ -15,7 +15,7 @@ use ratn_proto::types::{PoolStatus, Scale, WorkerStatus};
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-/// Workers of a pool that are being started at a time: more would only keep each other from being ready in time.
+/// Maximum number of workers of a pool that start at the same time: more would delay each other beyond their start timeout.
 pub(super) const STARTING_AT_ONCE: u32 = 32;
 
 #[derive(Debug)]
@@ -24,19 +24,19 @@ pub(super) struct Pool {
     host: String,
     size: Size,
     restarts: Restarts,
-    /// Templates that are waited for before the first worker is started.
+    /// Templates that need a ready worker before the first worker is started.
     waits_for: Vec<String>,
-    /// By number: the youngest is the last.
+    /// By number: the youngest is last.
     workers: BTreeMap<u64, Worker>,
     last_number: u64,
-    /// For so many more than the minimum the machine has room; `None` where none is needed.
+    /// How many more workers than the minimum fit on the machine; `None` where they need nothing of it.
     room: Option<u32>,
-    /// Of the workers that are gone.
+    /// Motions of workers that have ended.
     motion: Motion,
-    /// Workers that ended unasked, and how the last one did.
+    /// Number of workers that ended unasked, and how the last one ended.
     crashes: u64,
     last_exit: String,
-    /// How the last one ended that never served, since one was ready.
+    /// How the last worker ended that was never ready, since another one was ready.
     never_ready: String,
 }
 
@@ -48,7 +48,7 @@ impl Pool {
             waits_for: template.after.clone(),
             workers: BTreeMap::new(),
             last_number: 0,
-            // Until the machine has been looked at.
+            // Before the first measurement of the machine.
             room: template.needs.is_something().then_some(0),
             motion: Motion::default(),
             crashes: 0,
@@ -86,7 +86,7 @@ impl Pool {
         }
     }
 
-    /// There can be no more workers than so many for now, and why.
+    /// The most workers that are possible for now, and why.
     pub(super) fn shortage(&self) -> Option<Shortage> {
         let (name, there, (min, max, _)) = (&self.template.name, self.there(), self.size.bounds());
         let room = self.room.map(|room| there.saturating_add(room).max(min)).filter(|most| *most < max);
@@ -106,7 +106,7 @@ impl Pool {
         Some(Shortage { most, reason })
     }
 
-    /// When time alone changes something.
+    /// When the passing of time changes something.
     pub(super) fn deadline(&self) -> Option<Timestamp> {
         let restart = self.restarts.pause_until().filter(|_| self.missing() > 0);
         let (_, retires) = self.retiring(Timestamp(0));
@@ -115,7 +115,7 @@ impl Pool {
         self.workers.values().filter_map(Worker::deadline).chain(restart).chain(retires).chain(rest).min()
     }
 
-    /// Does what is due: kills, asks, and ends those that have been too many for long enough.
+    /// Does what is due: kills, health checks, and the end of workers that were surplus for long enough.
     pub(super) fn advance(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
         self.restarts.advance(now);
         self.workers.values_mut().for_each(|worker| worker.advance(now, &self.template, commands));
@@ -127,25 +127,25 @@ impl Pool {
         }
     }
 
-    /// Who ends now because there are too many, and when the next one does.
+    /// The surplus workers that end now, and when the next one does.
     fn retiring(&self, now: Timestamp) -> (Vec<u64>, Option<Timestamp>) {
         let surplus = self.there().saturating_sub(self.wanted() + self.surge());
         let idle = self.workers.iter().filter_map(|(number, worker)| Some((worker.idle_since()?, *number)));
         retiring(idle, surplus, self.template.idle(), now)
     }
 
-    /// What of the machine is free now; those that are starting have not taken theirs yet.
+    /// Takes a measurement of the machine; workers that are starting have not used their share yet.
     pub(super) fn looked(&mut self, sample: &Sample) {
         let starting = self.count(Worker::is_starting);
         self.room = self.template.needs.room(sample).map(|room| room.saturating_sub(starting));
     }
 
-    /// Whether it waits for other templates still.
+    /// Whether the pool still waits for other templates.
     pub(super) fn waits(&self) -> bool {
         !self.waits_for.is_empty()
     }
 
-    /// Of these templates there is somebody ready.
+    /// These templates have a ready worker.
     pub(super) fn follow(&mut self, ready: &BTreeSet<String>) {
         self.waits_for.retain(|name| !ready.contains(name));
     }
@@ -154,7 +154,8 @@ impl Pool {
         self.workers.values().any(Worker::is_ready)
     }
 
-    /// Starts what is missing, unless it has to wait; the ids. Of those that are to be replaced the next one goes where it may.
+    /// Starts missing workers, unless that has to wait; returns their ids. If workers are to be replaced, the next one ends where that is
+    /// possible.
     pub(super) fn fill(&mut self, now: Timestamp, commands: &mut Vec<Command>) -> Vec<String> {
         if self.count(Worker::is_starting) == 0 {
             self.size.all_started();
@@ -179,12 +180,12 @@ impl Pool {
         format!("{}-{number}@{}", self.template.name, self.host)
     }
 
-    /// Later workers have later numbers.
+    /// Later workers get numbers above this one.
     pub(super) fn go_on_after(&mut self, number: u64) {
         self.last_number = self.last_number.max(number);
     }
 
-    /// One that serves already is one of its workers from now on.
+    /// Adopts a worker that serves already.
     pub(super) fn adopt(
         &mut self,
         now: Timestamp,
@@ -205,7 +206,7 @@ impl Pool {
         self.workers.insert(number, adopted);
     }
 
-    /// A worker's process is gone.
+    /// A worker's process has ended.
     pub(super) fn exited(
         &mut self,
         now: Timestamp,
@@ -242,29 +243,30 @@ impl Pool {
         self.offer(now, commands);
     }
 
-    /// Offers those that serve, where nothing moves for who held one of before.
+    /// Offers the workers that serve, unless a device of an ended worker may still move for its former holder.
     fn offer(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
         if self.motion.is_over(now) && !self.moves_until_an_end() {
             self.workers.values_mut().for_each(|worker| worker.offer(&self.template.kind, commands));
         }
     }
 
-    /// What a worker of a process manager before this one moved may go on for so long, or for as long as the template says now.
+    /// An earlier process manager's workers may go on moving something for `bound`, or for as long as the template says now if that is
+    /// longer.
     pub(super) fn moved_before(&mut self, now: Timestamp, bound: Duration) {
         self.motion.goes_on(now, bound.max(self.template.standstill().unwrap_or_default()));
     }
 
-    /// For how long what its workers moved may go on when all of their processes end now; nothing where nothing moves.
+    /// How long devices may go on moving if all of its processes end now; `None` where nothing moves.
     pub(super) fn motion(&self, now: Timestamp) -> Option<Duration> {
         self.workers.values().filter_map(Worker::motion).chain(self.motion.bound(now)).max()
     }
 
-    /// Whether one that is being ended may move something until its process is gone, and for the bound after that.
+    /// Whether a worker that is being ended may move something until its process has ended, and for the bound after that.
     fn moves_until_an_end(&self) -> bool {
         self.workers.values().any(|worker| worker.is_ending() && worker.motion().is_some())
     }
 
-    /// A worker's resource is there.
+    /// A worker's resource was accepted.
     pub(super) fn offered(&mut self, now: Timestamp, number: u64, commands: &mut Vec<Command>) {
         self.never_ready.clear();
         if let Some(worker) = self.workers.get_mut(&number) {
@@ -272,21 +274,21 @@ impl Pool {
         }
     }
 
-    /// A worker's resource is not taken.
+    /// A worker's resource was refused.
     pub(super) fn refused(&mut self, now: Timestamp, number: u64, why: &str) {
         if let Some(worker) = self.workers.get_mut(&number) {
             worker.refused(now + self.template.start_timeout(), why);
         }
     }
 
-    /// So many more are asked for, also where it has failed; the ids.
+    /// Starts `count` more workers, also where the pool has failed; returns their ids.
     pub(super) fn spawn(
         &mut self,
         now: Timestamp,
         count: u32,
         commands: &mut Vec<Command>,
     ) -> Result<Vec<String>, PoolError> {
-        // What a failed pool lacks is wanted no more.
+        // Workers that a failed pool lacks are not wanted any more.
         let wanted = if self.restarts.has_failed() { self.there() } else { self.size.asked() };
         if !self.size.ask(wanted, count) {
             let template = self.template.name.clone();
@@ -299,8 +301,8 @@ impl Pool {
         Ok(started.split_off(started.len().saturating_sub(count as usize)))
     }
 
-    /// So many are demanded now. What does not serve yet and is wanted no more is ended; the rest stays. Of what moves something there are
-    /// no more because others wait for one that is held.
+    /// Sets the demand. Surplus workers that do not serve yet are ended; the others stay. A pool that moves something does not grow for
+    /// requests that wait for a held worker.
     pub(super) fn demanded(&mut self, now: Timestamp, demanded: Demanded, commands: &mut Vec<Command>) {
         let queued = if self.template.grows_with_the_queue() { demanded.queued } else { 0 };
         if self.size.demand(Demanded { queued, ..demanded }) && self.restarts.has_failed() {
@@ -313,14 +315,14 @@ impl Pool {
         }
     }
 
-    /// Somebody holds a worker's resource now, or nobody any more.
+    /// A worker's resource is held now, or no longer held.
     pub(super) fn used(&mut self, now: Timestamp, number: u64, held: bool, commands: &mut Vec<Command>) {
         if let Some(worker) = self.workers.get_mut(&number) {
             worker.used(now, held, commands);
         }
     }
 
-    /// A worker's resource is gone, as it was to be.
+    /// A worker's resource was withdrawn as requested.
     pub(super) fn withdrawn(&mut self, now: Timestamp, number: u64, commands: &mut Vec<Command>) {
         let kill_at = now + self.template.stop_timeout();
         if let Some(worker) = self.workers.get_mut(&number) {
@@ -336,7 +338,7 @@ impl Pool {
         }
     }
 
-    /// Other workers are to take the place of this one, or of all; the ids of those that will go. A failed pool is tried again.
+    /// Marks this worker, or all, for replacement; returns the ids of those that will end. A failed pool is tried again.
     pub(super) fn restart(&mut self, only: Option<u64>) -> Vec<String> {
         self.restarts.forgive();
         let chosen = |number: &u64| only.is_none_or(|only| only == *number);
@@ -344,8 +346,8 @@ impl Pool {
         workers.filter_map(|(_, worker)| worker.outdate().then(|| worker.id().to_owned())).collect()
     }
 
-    /// Another session offers workers from now on: all that there are end now, and others take their places. Of the session before
-    /// somebody else makes leases, which these workers confirm: what they move may move until they are gone.
+    /// Another session offers the workers from now on: all existing ones end now and are replaced. Another caller grants leases of the old
+    /// session, and these workers accept them: so they may move their devices until their processes have ended.
     pub(super) fn renew(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
         self.restarts.forgive();
         let kill_at = now + self.template.stop_timeout();
@@ -354,7 +356,7 @@ impl Pool {
         }
     }
 
-    /// One that is to be replaced ends once there is one more than is wanted, and all of them are ready. One at a time.
+    /// Ends a worker that is to be replaced once there is one more than wanted and all are ready. One at a time.
     fn roll(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
         let leaving = self.workers.values().any(Worker::is_leaving);
         let ready = self.workers.values().all(Worker::is_ready);
@@ -367,19 +369,19 @@ impl Pool {
         }
     }
 
-    /// One more than is wanted is started where it is to take the place of another.
+    /// Number of workers to start beyond the wanted ones to replace another: 0 or 1.
     fn surge(&self) -> u32 {
         let leaving = self.workers.values().any(Worker::is_leaving);
         let surges = !leaving && !self.is_single() && self.workers.values().any(Worker::is_outdated);
         u32::from(surges)
     }
 
-    /// Whether there cannot be one more than is wanted, not even for a moment: there is one port, or one robot that they move.
+    /// Whether there can never be one more than wanted, not even for a moment: they share one port, or move one robot.
     fn is_single(&self) -> bool {
         matches!(self.template.readiness, Readiness::Port { .. }) || self.template.standstill().is_some()
     }
 
-    /// From now on it has another size. What is above the new maximum ends now, or once nobody holds it.
+    /// Changes the size. Workers above the new maximum end now, or once nobody holds them.
     ///
     /// # Errors
     /// [`PoolError::Size`].
@@ -410,7 +412,7 @@ impl Pool {
         }
     }
 
-    /// Ends every worker. What has not ended after `patience` is killed.
+    /// Ends every worker. Workers that have not ended after `patience` are killed.
     pub(super) fn shut_down(&mut self, now: Timestamp, patience: Duration, commands: &mut Vec<Command>) {
         let kill_at = now + patience.min(self.template.stop_timeout());
         for worker in self.workers.values_mut() {
@@ -426,12 +428,12 @@ impl Pool {
         self.size.wanted(self.count(|worker| worker.is_ready() && worker.is_held()))
     }
 
-    /// So many are to be started now.
+    /// Number of workers to start now.
     fn missing(&self) -> u32 {
         self.lacking().min(STARTING_AT_ONCE.saturating_sub(self.count(Worker::is_starting)))
     }
 
-    /// So many are to be started, now or when others have been.
+    /// Number of workers to start, now or after others have started.
     fn lacking(&self) -> u32 {
         let there = if self.is_single() { self.count(|_| true) } else { self.there() };
         let wanted = self.wanted() + self.surge();

@@ -1,16 +1,16 @@
-//! Restarts after a crash: another worker at once after a first one, later after each further one, and none any more after
-//! [`Template::crash_limit`] in a row: then the pool has failed, until somebody asks for it.
+//! Restarts after a crash: at once after the first crash, with growing delay after further ones, and none after
+//! [`Template::crash_limit`] crashes in a row: then the pool has failed, until a client asks for workers.
 //!
-//! Pauses are shorter than they say by up to a quarter, differently on every host and each time (but the same in every run), so that
-//! pools that lost the same thing at the same moment do not come back at the same moment.
+//! Delays are shortened by up to a quarter, differently on every host and each time (but the same in every run), so that pools that
+//! lost the same resource at the same moment do not restart at the same moment.
 
 use crate::process_manager::template::Template;
 use ratn_model::time::Timestamp;
 use std::time::Duration;
 
-/// Doublings of a pause; what comes to more is more than any maximum.
+/// Maximum number of doublings of a delay; more would exceed any allowed maximum.
 const MOST_DOUBLINGS: u32 = 20;
-/// A pause is shortened by up to one part in so many.
+/// A delay is shortened by up to one part in this many.
 const JITTER: u64 = 4;
 
 /// The crashes of a pool in a row.
@@ -24,13 +24,13 @@ pub(super) struct Restarts {
 }
 
 impl Restarts {
-    /// None yet, in the pool of that name.
+    /// No crashes yet, in the pool of that template.
     pub(super) fn new(host: &str, template: &str) -> Restarts {
         let seed = host.bytes().chain([0]).chain(template.bytes()).fold(0, |seed, byte| mixed(seed ^ u64::from(byte)));
         Restarts { seed, crashes: 0, last: Timestamp(0), not_before: None, failure: String::new() }
     }
 
-    /// A worker has crashed that served since `served`, if it did. `what` says which and how, its last words included.
+    /// A worker has crashed; it had served since `served`, if at all. `what` says which worker and how, its last output included.
     pub(super) fn crashed(&mut self, now: Timestamp, template: &Template, served: Option<Timestamp>, what: &str) {
         let stable = served.is_some_and(|since| now.since(since) >= template.stable());
         self.crashes = if stable || self.is_long_ago(now, template) { 1 } else { self.crashes + 1 };
@@ -43,7 +43,7 @@ impl Restarts {
         }
     }
 
-    /// Whether no crash loop can be so slow: nothing has crashed for longer than a worker takes to start, to be stable and to pause.
+    /// Whether the last crash is too long ago for a crash loop: longer than a worker takes to start, to become stable and to pause.
     fn is_long_ago(&self, now: Timestamp, template: &Template) -> bool {
         let pause = Duration::from_millis(template.max_backoff_ms);
         now.since(self.last) > template.start_timeout() + template.stable() + pause
@@ -57,13 +57,13 @@ impl Restarts {
         Duration::from_micros(pause_us - self.seed % (pause_us / JITTER + 1))
     }
 
-    /// Somebody asks for workers: what was is forgotten.
+    /// A client asks for workers: past crashes are forgotten.
     pub(super) fn forgive(&mut self) {
         (self.crashes, self.not_before) = (0, None);
         self.failure.clear();
     }
 
-    /// Why nothing is started any more; empty while all is well.
+    /// Why no more workers are started; empty while the pool has not failed.
     pub(super) fn failure(&self) -> &str {
         &self.failure
     }
@@ -72,18 +72,18 @@ impl Restarts {
         !self.failure.is_empty()
     }
 
-    /// A pause that is over is forgotten.
+    /// Forgets a delay that is over.
     pub(super) fn advance(&mut self, now: Timestamp) {
         self.not_before = self.not_before.filter(|at| *at > now);
     }
 
-    /// Whether a worker may be started now: neither has it failed, nor is it pausing.
+    /// Whether a worker may be started now: the pool has not failed and is not in a delay.
     pub(super) fn allow(&mut self, now: Timestamp) -> bool {
         self.advance(now);
         !self.has_failed() && self.not_before.is_none()
     }
 
-    /// When the pause is over.
+    /// When the delay is over.
     pub(super) fn pause_until(&self) -> Option<Timestamp> {
         self.not_before
     }
@@ -153,7 +153,7 @@ mod tests {
 
     #[test]
     fn a_crash_long_after_the_last_one_is_a_first_one() {
-        // Starting takes 10 s at the most, being stable 10 s, a pause 5 s.
+        // Starting takes 10 s at most, becoming stable 10 s, a delay 5 s.
         for (after_s, failed) in [(25, true), (26, false)] {
             let mut restarts = Restarts::new("compute", "planner");
             restarts.crashed(Timestamp(0), &template(2), None, "");

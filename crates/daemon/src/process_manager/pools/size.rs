@@ -3,10 +3,10 @@
 //! ```text
 //!   wanted = max(asked for (at least `min`), held) + spares,   or what is demanded or queued for where that is more;   `max` at the most
 //! ```
-//! Those above it end when they have been idle for long enough, the longest idle ones first; who is held never does. What is demanded does
-//! not exist, and is wanted for as long as that is so. What is queued for exists and is held: a worker that is being started for it is
-//! started to the end also where that wait is over by then, for the next one to find it. If it were ended, waits that are a little shorter
-//! than a start would start workers again and again and never have one.
+//! Idle workers above this size end after a while, those that have been idle for longest first; held workers never do. Demand (`demanded`)
+//! is for workers that do not exist, and counts while it lasts. The queue (`queued`) waits for workers that exist and are held: a worker
+//! that is being started for it is started to the end even where that wait is over by then, for the next request. If it were ended, waits
+//! slightly shorter than a start would start workers again and again and never have one.
 
 use super::demand::Demanded;
 use ratn_model::time::Timestamp;
@@ -19,17 +19,17 @@ pub(super) struct Size {
     min: u32,
     max: u32,
     spares: u32,
-    /// As the config has it: more there never are.
+    /// The maximum of the config, which `max` never exceeds.
     most: u32,
-    /// What is kept without any demand.
+    /// Number of workers that are kept without any demand.
     asked: u32,
-    /// How many there should be for those who wait for more than exists; 0 when nobody does.
+    /// Workers wanted for requests that need more than exists; 0 without such requests.
     demanded: u32,
-    /// How many there should be for those who wait for what is held; 0 when nobody does.
+    /// Workers wanted for requests that wait for held ones; 0 without such requests.
     queued: u32,
-    /// The most of that since nothing was being started.
+    /// The highest `queued` since the last time that no worker was starting.
     begun: u32,
-    /// More is missing than there may be.
+    /// The demand exceeds the maximum.
     short: bool,
 }
 
@@ -38,15 +38,15 @@ impl Size {
         Size { min, max, spares, most: max, asked: min, demanded: 0, queued: 0, begun: 0, short: false }
     }
 
-    /// At least so many are kept, at most so many started, and so many kept ready beside those that are held.
+    /// Minimum and maximum number of workers, and the number kept ready beside held ones.
     pub(super) fn bounds(&self) -> (u32, u32, u32) {
         (self.min, self.max, self.spares)
     }
 
-    /// From now on it is so; what was asked for is forgotten where there is a new minimum.
+    /// Changes the bounds; a new minimum also replaces the number that was asked for.
     ///
     /// # Errors
-    /// In words, where the config does not allow it; nothing is changed then.
+    /// A message where the config does not allow it; nothing is changed then.
     pub(super) fn scale(&mut self, scale: Scale) -> Result<(), String> {
         let (min, max) = (scale.min.unwrap_or(self.min), scale.max.unwrap_or(self.max));
         let spares = scale.spares.unwrap_or(self.spares);
@@ -66,19 +66,19 @@ impl Size {
         Ok(())
     }
 
-    /// How many there shall be now that so many are held.
+    /// The wanted number of workers while `held` of them are held.
     pub(super) fn wanted(&self, held: u32) -> u32 {
         let others = self.demanded.max(self.queued).max(self.begun);
         self.asked.max(held).saturating_add(self.spares).max(others).min(self.max)
     }
 
-    /// More is missing than there may be.
+    /// Whether the demand exceeds the maximum.
     pub(super) fn is_short(&self) -> bool {
         self.short
     }
 
-    /// Somebody asks for so many more beyond `counted` (what was asked for so far, or of a failed pool what there is).
-    /// False, and nothing is changed, where that were more than the maximum.
+    /// A client asks for more workers beyond `counted` (the number asked for so far, or in a failed pool the existing ones). False, with
+    /// nothing changed, where that would exceed the maximum.
     pub(super) fn ask(&mut self, counted: u32, more: u32) -> bool {
         if more > self.max.saturating_sub(counted) {
             return false;
@@ -87,17 +87,17 @@ impl Size {
         true
     }
 
-    /// What was asked for so far.
+    /// The number that clients have asked for so far.
     pub(super) fn asked(&self) -> u32 {
         self.asked
     }
 
-    /// One was ended on request.
+    /// A worker was ended on request.
     pub(super) fn one_less(&mut self) {
         self.asked = self.asked.saturating_sub(1).max(self.min);
     }
 
-    /// So many are demanded now. True where nothing was missing before.
+    /// Sets the demand. True where there was none before.
     pub(super) fn demand(&mut self, demanded: Demanded) -> bool {
         let begins = self.demanded == 0 && demanded.missing > 0;
         self.short = demanded.missing > self.max;
@@ -113,7 +113,7 @@ impl Size {
     }
 }
 
-/// Which of those that are idle (since when, by number) are to end now, of so many too many; and when the next one is.
+/// The idle workers (since when, and number) that end now where `surplus` are too many, and when the next one does.
 pub(super) fn retiring(
     idle: impl Iterator<Item = (Timestamp, u64)>,
     surplus: u32,

@@ -1,4 +1,4 @@
-//! The pools by virtual time.
+//! The pools in virtual time.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use super::*;
@@ -10,7 +10,7 @@ use ratn_model::value::Value;
 use ratn_proto::types::WorkerState;
 use std::ops::Deref;
 
-/// The pools of one template, with what they wanted done since the last look.
+/// The pools of one template, with their commands since the last look.
 struct Rig {
     pools: Pools,
     commands: Vec<Command>,
@@ -78,7 +78,7 @@ impl Rig {
         self.handle(now, Event::Used { id: id.to_owned(), held });
     }
 
-    /// Lets the clock go on, deadline by deadline; the resource manager withdraws what is to leave, and processes end as asked.
+    /// Advances the clock, deadline by deadline; the resource manager withdraws retired resources, and processes end as asked.
     fn run_until(&mut self, until: Timestamp) {
         while let Some(now) = self.next_deadline().filter(|at| *at <= until) {
             self.advance(now);
@@ -246,7 +246,7 @@ fn of_a_crowd_some_are_started_at_a_time_and_nobody_is_late_because_of_the_other
     let mut begun = started(&mut pools);
     assert_eq!(begun.len(), pool::STARTING_AT_ONCE as usize);
     for ready in 0..promised.len() {
-        // All of them together take much longer than one may.
+        // All of them together take much longer to start than one may.
         pools.advance(at(5.0 * ready as f64 / f64::from(pool::STARTING_AT_ONCE)));
         let id = begun[ready].clone();
         pools.bring_up(at(5.0 * ready as f64 / f64::from(pool::STARTING_AT_ONCE)), &id);
@@ -327,7 +327,7 @@ fn for_those_who_wait_workers_are_started_once_and_up_to_the_maximum() {
     assert_eq!(started(&mut pools).len(), 0);
     pools.demanded(now, &demand(0, 2));
     assert_eq!(started(&mut pools).len(), 2);
-    // One of them is there: as many are wanted as before.
+    // One of them is ready: as many are wanted as before.
     pools.serving(now, "planner-1@compute");
     pools.handle(at(1.0), Event::Offered { id: "planner-1@compute".to_owned() });
     pools.demanded(now, &demand(1, 1));
@@ -335,7 +335,7 @@ fn for_those_who_wait_workers_are_started_once_and_up_to_the_maximum() {
     pools.demanded(now, &demand(1, 9));
     assert_eq!(started(&mut pools).len(), 1);
     assert_eq!(pools.shortages()["PathPlanner"], shortage(3, "`planner` has 3 workers at the most"));
-    // Nobody waits any more: what does not serve yet is ended, the other one stays.
+    // No more demand: the workers that do not serve yet are ended, the other one stays.
     pools.demanded(now, &[]);
     let ended: Vec<Command> = pools.take_commands();
     let terminated = ended.iter().filter_map(|command| match command {
@@ -346,7 +346,7 @@ fn for_those_who_wait_workers_are_started_once_and_up_to_the_maximum() {
     assert!(pools.shortages().is_empty());
 }
 
-/// So many wait for what is held.
+/// This many requests wait for held workers.
 fn queue(provided: u32, queued: u32) -> [Demand; 1] {
     demand(provided, queued).map(|demand| Demand { queued: queued.into(), ..demand })
 }
@@ -360,7 +360,7 @@ fn a_worker_is_started_for_those_who_wait_for_what_is_held_and_ends_when_it_has_
     pools.demanded(at(1.0), &queue(1, 3));
     assert_eq!(started(&mut pools), ["planner-2@compute"]);
     assert!(pools.shortages().is_empty(), "nothing is missing");
-    // The wait is over before the worker is there: it is not ended for that, and the next wait starts no other one.
+    // The wait is over before the worker is ready: the worker is not ended, and the next wait starts no other one.
     pools.demanded(at(1.2), &[]);
     pools.demanded(at(1.4), &queue(1, 1));
     pools.demanded(at(1.6), &[]);
@@ -519,7 +519,7 @@ fn a_template_starts_after_those_it_waits_for() {
     assert_eq!(pools.shortages()["Any"], shortage(0, "`a` waits until there is a worker of b, c"));
     pools.bring_up(at(1.0), "c-1@compute");
     assert_eq!(started(&mut pools), ["b-1@compute"]);
-    // What has ended since was there.
+    // A worker that has ended since then still counts as having been ready.
     pools.exited(at(2.0), "c-1@compute", "killed by signal 9", "");
     pools.bring_up(at(3.0), "b-1@compute");
     assert_eq!(started(&mut pools), ["c-2@compute", "a-1@compute"]);
@@ -696,11 +696,11 @@ fn under_another_session_every_worker_ends_at_once_also_one_that_only_serves_or_
     assert!(withdrawn, "{:?}", pools.commands);
     let next = started(&mut pools);
     assert_eq!(next, ["planner-5@compute", "planner-6@compute", "planner-7@compute", "planner-8@compute"]);
-    // What it says later makes no resource of it.
+    // A later report from it does not make it a resource.
     pools.serving(at(1.1), &all[2]);
     pools.handle(at(1.1), Event::Offered { id: all[1].clone() });
     assert_eq!(offered(&mut pools), [] as [&str; 0]);
-    // Its process was not there before.
+    // Its process was started only after it was told to end.
     pools.spawned(&all[3]);
     assert_eq!(pools.take_commands()[0], Command::Terminate { id: all[3].clone() });
     pools.advance(at(3.0));
@@ -772,7 +772,7 @@ fn under_another_session_what_moves_is_offered_when_the_bound_has_passed_since_t
     pools.serving(at(1.7), "planner-3@compute");
     let reason = &pools.status()[0].workers[1].reason;
     assert!(reason.contains("may still move"), "{reason}");
-    // A bound after the first has gone is not the end of it: the second one moves still.
+    // The bound after the end of the first worker is not enough: the second one may still move.
     pools.advance(at(3.0));
     pools.advance(at(8.0));
     assert_eq!(offered(&mut pools), [] as [&str; 0]);
@@ -838,7 +838,7 @@ fn what_moved_for_somebody_is_offered_anew_when_the_bound_has_passed_and_at_once
     assert!(next(&mut pools, at(40.0)), "nobody held it");
     pools.handle(at(40.0), Event::Offered { id: "planner-3@compute".to_owned() });
 
-    // Nobody waits for a holder for ever.
+    // Waiting for a holder is bounded.
     pools.used(at(41.0), "planner-3@compute", true);
     pools.stop(at(41.0), "planner-3@compute");
     pools.advance(at(42.0));
@@ -923,7 +923,7 @@ fn one_that_was_adopted_has_the_bound_that_it_was_adopted_with() {
     let mut left = moving(|_| {});
     left.bring_up(at(0.0), "planner-1@compute");
     let left = left.status()[0].workers[0].clone();
-    // Not the one that was started at the beginning.
+    // Replaces the worker that was started at the beginning.
     pools.exited(at(0.0), "planner-1@compute", "was not there", "");
     let commands = pools.pools.adopt(at(0.0), &left, Some(seconds(30)), false).unwrap();
     let bound = |command: &Command| match command {

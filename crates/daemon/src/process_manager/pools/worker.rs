@@ -8,7 +8,7 @@
 //!                     failed (killed; its exit is a crash) ◀───────────┴───────────────────────────┤
 //!                                                                          stopping (SIGTERM, later SIGKILL) ◀┘
 //! ```
-//! How many there are, and what follows one that is gone, is not its business.
+//! The number of workers, and what follows the end of one, are decided elsewhere.
 
 use super::command::Command;
 use super::liveness;
@@ -24,19 +24,19 @@ pub(super) struct Worker {
     phase: Phase,
     /// Since when it serves.
     serves_since: Option<Timestamp>,
-    /// Since when nobody holds its resource; `None` while somebody does.
+    /// Since when its resource is not held; `None` while it is held.
     idle_since: Option<Timestamp>,
     liveness: liveness::Liveness,
-    /// The resource manager does not take its resource: why, and until when that is waited for.
+    /// The resource manager refuses its resource: the end of the wait for that, and the reason.
     refused: Option<(Timestamp, String)>,
-    /// Another one is to take its place.
+    /// It is to be replaced.
     outdated: bool,
-    /// Nothing moves by it: it was not offered yet, or was withdrawn when nobody had held it for its bound.
+    /// It moves nothing: it was not offered yet, or was withdrawn after nobody had held it for its bound.
     at_rest: bool,
-    /// What it moves may go on for so long after its end; nothing for one that moves nothing.
+    /// How long its device may go on moving after the worker's end; `None` for a worker without one.
     standstill: Option<Duration>,
     pid: u32,
-    /// What it may use of the machine, for people.
+    /// Its resource limits, for people.
     limits: String,
     endpoint: String,
 }
@@ -46,27 +46,27 @@ enum Phase {
     Starting {
         until: Timestamp,
     },
-    /// Not offered while something may move for who held one before it.
+    /// Not offered while an earlier worker's device may still move for its former holder.
     Serving {
         offered: bool,
     },
     Ready,
-    /// Its resource goes as soon as nobody holds it; at the latest then, where it was asked to stop.
+    /// Its resource is withdrawn as soon as nobody holds it; at `until` at the latest, where it was asked to stop.
     Leaving {
         until: Option<Timestamp>,
     },
-    /// Killed because of that: its exit is a crash.
+    /// Killed for the reason `why`: its exit counts as a crash.
     Failed {
         why: String,
     },
-    /// Killed at `kill_at`; without one it has been.
+    /// To be killed at `kill_at`; `None` when it has been killed.
     Stopping {
         kill_at: Option<Timestamp>,
     },
 }
 
 impl Worker {
-    /// One whose process is being started now.
+    /// A worker whose process is being started now.
     pub(super) fn starting(now: Timestamp, id: String, template: &Template) -> Worker {
         Worker {
             id,
@@ -89,12 +89,12 @@ impl Worker {
         &self.id
     }
 
-    /// As one that may move something for so long after its end.
+    /// Sets how long its device may go on moving after the worker's end.
     pub(super) fn with_standstill(self, standstill: Option<Duration>) -> Worker {
         Worker { standstill, ..self }
     }
 
-    /// Its process is there. One that was to end before is ended now.
+    /// Its process was started. A worker that was to end before that is ended now.
     pub(super) fn spawned(&mut self, pid: u32, limits: String, commands: &mut Vec<Command>) {
         (self.pid, self.limits) = (pid, limits);
         match self.phase {
@@ -107,7 +107,7 @@ impl Worker {
         commands.push(Command::Notify(self.status()));
     }
 
-    /// It serves, and can be offered. Too late is too late.
+    /// It serves, and can be offered; ignored where its start timeout is over.
     pub(super) fn serving(&mut self, now: Timestamp, endpoint: &str) {
         if self.is_starting() {
             self.phase = Phase::Serving { offered: false };
@@ -132,13 +132,13 @@ impl Worker {
         self.phase == Phase::Serving { offered: false }
     }
 
-    /// Whether it still serves is to be asked now.
+    /// A health check is due now.
     pub(super) fn ask_at_once(&mut self, now: Timestamp) {
         self.liveness.ask_at_once(now);
     }
 
-    /// The resource manager does not take its resource. That may pass, as where a session of before still has one of its id: it is waited
-    /// for until then.
+    /// The resource manager refuses its resource. That may be temporary, for example while an earlier session still has a resource with
+    /// this id: it is waited for until then.
     pub(super) fn refused(&mut self, until: Timestamp, why: &str) {
         if matches!(self.phase, Phase::Serving { .. }) {
             let (_, words) = self.refused.get_or_insert_with(|| (until, String::new()));
@@ -146,7 +146,7 @@ impl Worker {
         }
     }
 
-    /// Its resource is there.
+    /// Its resource was accepted.
     pub(super) fn offered(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
         self.refused = None;
         if matches!(self.phase, Phase::Serving { .. }) {
@@ -156,7 +156,7 @@ impl Worker {
         }
     }
 
-    /// Somebody holds it now, or nobody any more.
+    /// It is held now, or no longer held.
     pub(super) fn used(&mut self, now: Timestamp, held: bool, commands: &mut Vec<Command>) {
         match (held, self.idle_since) {
             (true, _) => self.idle_since = None,
@@ -168,7 +168,7 @@ impl Worker {
         }
     }
 
-    /// Gives its resource back as soon as nobody holds it, and ends it then; if it was held meanwhile, it stays.
+    /// Withdraws its resource as soon as nobody holds it, and then ends it; if it is held again meanwhile, it stays.
     pub(super) fn retire(&mut self, commands: &mut Vec<Command>) {
         if self.phase == Phase::Ready {
             self.phase = Phase::Leaving { until: None };
@@ -176,7 +176,7 @@ impl Worker {
         }
     }
 
-    /// Somebody was given its resource before it could be withdrawn.
+    /// Its resource was granted before it could be withdrawn.
     pub(super) fn kept(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
         if self.phase == (Phase::Leaving { until: None }) {
             self.phase = Phase::Ready;
@@ -185,9 +185,9 @@ impl Worker {
         }
     }
 
-    /// Its resource is gone as it was to be: nothing is given to it any more.
+    /// Its resource was withdrawn as requested: it can no longer be granted.
     ///
-    /// What its last holder moved may go on for the bound after the release: a goal that was told to stop may overrun.
+    /// The motion of its last holder may go on for the bound after the release: a goal that was cancelled may overrun.
     pub(super) fn withdrawn(&mut self, now: Timestamp, kill_at: Timestamp, commands: &mut Vec<Command>) {
         if matches!(self.phase, Phase::Leaving { .. }) {
             let bound = self.standstill.unwrap_or_default();
@@ -196,7 +196,7 @@ impl Worker {
         }
     }
 
-    /// Ends it once nobody holds its resource, at the latest at `until`. False where it is ending already.
+    /// Ends it once nobody holds its resource, at `until` at the latest. False where it is ending already.
     pub(super) fn drain(&mut self, until: Timestamp, kill_at: Timestamp, commands: &mut Vec<Command>) -> bool {
         match self.phase {
             Phase::Ready => {
@@ -215,7 +215,7 @@ impl Worker {
         }
     }
 
-    /// Another one is to take its place. False where it is ending already.
+    /// Marks it for replacement. False where it is ending already.
     pub(super) fn outdate(&mut self) -> bool {
         self.outdated = !self.is_leaving();
         self.outdated
@@ -232,7 +232,7 @@ impl Worker {
         true
     }
 
-    /// The session that it was told offers it is somebody else's: it ends now, and until its process is gone it may move for them.
+    /// Its session belongs to another caller: it is ended now, and until its process has ended it may move something for that caller.
     pub(super) fn disown(&mut self, kill_at: Timestamp, commands: &mut Vec<Command>) {
         self.at_rest = false;
         if !matches!(self.phase, Phase::Failed { .. }) {
@@ -240,12 +240,12 @@ impl Worker {
         }
     }
 
-    /// It has said that it still serves.
+    /// A health check found it serving.
     pub(super) fn answered(&mut self, now: Timestamp) {
         self.liveness.answered(now);
     }
 
-    /// It has not: it is taken away from whoever holds it, and killed.
+    /// A health check failed: it is withdrawn from its holder, and killed.
     pub(super) fn unanswered(&mut self, why: &str, commands: &mut Vec<Command>) {
         if self.is_live() {
             commands.push(Command::Withdraw { id: self.id.clone() });
@@ -292,7 +292,7 @@ impl Worker {
         commands.push(Command::Kill { id: self.id.clone() });
     }
 
-    /// When time alone changes it.
+    /// When the passing of time changes something.
     pub(super) fn deadline(&self) -> Option<Timestamp> {
         let of_phase = match self.phase {
             Phase::Starting { until } => Some(until),
@@ -313,17 +313,17 @@ impl Worker {
         self.phase == Phase::Ready
     }
 
-    /// Whether its end was asked for, so that another one is to take its place.
+    /// Whether it was asked to end and is to be replaced.
     pub(super) fn is_leaving(&self) -> bool {
         matches!(self.phase, Phase::Leaving { .. } | Phase::Stopping { .. })
     }
 
-    /// Whether another one is to take its place, and it does not end yet.
+    /// Whether it is to be replaced, and does not end yet.
     pub(super) fn is_outdated(&self) -> bool {
         self.outdated && !self.is_leaving()
     }
 
-    /// Whether its exit is what was asked for.
+    /// Whether its exit was requested.
     pub(super) fn is_stopping(&self) -> bool {
         matches!(self.phase, Phase::Stopping { .. })
     }
@@ -333,22 +333,22 @@ impl Worker {
         matches!(self.phase, Phase::Stopping { .. } | Phase::Failed { .. })
     }
 
-    /// For how long what it moves may go on after its end; nothing where nothing moves by it.
+    /// How long its device may go on moving after the worker's end; `None` where nothing moves.
     pub(super) fn motion(&self) -> Option<Duration> {
         self.standstill.filter(|_| !self.at_rest)
     }
 
-    /// Whether it serves, and is to answer.
+    /// Whether it serves, and has to answer health checks.
     fn is_live(&self) -> bool {
         matches!(self.phase, Phase::Serving { .. } | Phase::Ready | Phase::Leaving { .. })
     }
 
-    /// Whether somebody holds its resource.
+    /// Whether its resource is held.
     pub(super) fn is_held(&self) -> bool {
         self.idle_since.is_none()
     }
 
-    /// Since when it is ready and nobody holds it.
+    /// Since when it is ready and not held.
     pub(super) fn idle_since(&self) -> Option<Timestamp> {
         self.idle_since.filter(|_| self.is_ready())
     }
@@ -360,7 +360,7 @@ impl Worker {
     pub(super) fn status(&self) -> WorkerStatus {
         let state = match self.phase {
             Phase::Starting { .. } | Phase::Serving { .. } => WorkerState::Starting,
-            // Where somebody holds it in the same moment it stays.
+            // It stays ready if it is held again in the same moment.
             Phase::Ready | Phase::Leaving { until: None } => WorkerState::Ready,
             Phase::Leaving { until: Some(_) } | Phase::Failed { .. } | Phase::Stopping { .. } => WorkerState::Stopping,
         };
@@ -384,7 +384,7 @@ impl Worker {
         }
     }
 
-    /// As it is told when its process is gone; why it was killed counts more than how it ended.
+    /// Its last status, when its process has ended; the reason for killing it takes precedence over how it ended.
     pub(super) fn exited(&self, how: &str) -> WorkerStatus {
         let reason = match &self.phase {
             Phase::Failed { why } => why.clone(),
@@ -462,7 +462,7 @@ mod tests {
         assert!(worker.deadline().is_none());
         worker.serving(at(4.0), "unix:/late");
         assert!(commands(|c| worker.offer("PathPlanner", c)).is_empty());
-        // Its process came only now.
+        // Its process was started only now.
         assert_eq!(commands(|c| worker.spawned(4711, String::new(), c)), [Command::Kill { id: ID.into() }]);
         assert_eq!(
             worker.exited("killed by signal 9").reason,

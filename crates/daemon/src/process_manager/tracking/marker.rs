@@ -1,16 +1,16 @@
-//! The marker in the environment of a worker's processes: of which process manager and of which worker they are. A process inherits it from
-//! whoever started it. Processes of another user are left alone, whatever they carry, and so are this process and whoever started it.
+//! The marker in the environment of a worker's processes: it names their process manager and their worker. A process inherits it from its
+//! parent. Processes of other users are left alone, whatever they carry, and so are this process and its ancestors.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::os::unix::ffi::{OsStrExt, OsStringExt};
 use std::os::unix::fs::{FileExt, MetadataExt};
 
-/// The variable. A process manager that is itself a worker's process adds its own behind that one's: `OUTER/planner-1@a,INNER/planner-1@b`.
+/// The variable. A process manager that is itself a worker's process appends its own marker: `OUTER/planner-1@a,INNER/planner-1@b`.
 const VARIABLE: &str = "RATN_WORKER_OF";
 const BETWEEN: u8 = b',';
 
-/// Of a worker of this process manager.
+/// The marker of a worker of this process manager.
 pub(super) fn of(instance: &str, id: &str) -> (OsString, OsString) {
     let outer = std::env::var_os(VARIABLE).filter(|outer| !outer.is_empty());
     let mut value = outer.map(|outer| [outer.as_bytes(), &[BETWEEN]].concat()).unwrap_or_default();
@@ -18,16 +18,16 @@ pub(super) fn of(instance: &str, id: &str) -> (OsString, OsString) {
     (VARIABLE.into(), OsString::from_vec(value))
 }
 
-/// Whether it can be the name of a process manager in a marker.
+/// Whether the text can be the name of a process manager in a marker.
 pub(super) fn is_name(text: &str) -> bool {
     !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'-')
 }
 
-/// What a look at the processes of this machine has shown.
+/// Result of a scan of this machine's processes.
 pub(super) struct Carriers {
-    /// Those that carry the marker of a worker that was asked for.
+    /// Processes that carry the marker of a wanted worker.
     pub(super) found: Vec<u32>,
-    /// Those of which it cannot be said yet: they are changing their program (`execve`), or ending.
+    /// Processes whose marker cannot be read yet: they are changing their program (`execve`), or ending.
     pub(super) unknown: Vec<u32>,
 }
 
@@ -54,9 +54,9 @@ pub(super) fn carriers(instance: &str, users: &BTreeSet<u32>, wanted: impl Fn(&s
 
 /// The environment of a process, as far as the kernel shows it.
 enum Environment {
-    /// Empty of a process that has ended, that has none, or that may not be looked at.
+    /// Empty for a process that has ended, that has none, or that may not be read.
     Known(Vec<u8>),
-    /// The kernel shows none while a process changes its program, although it will have one.
+    /// The kernel shows no environment while a process changes its program, although it will have one.
     NotYet,
 }
 
@@ -67,7 +67,7 @@ fn environment_of(pid: u32) -> Environment {
     }
 }
 
-/// All of a file by one call to the kernel: what is read in parts ends in the middle when the process changes its program in between.
+/// Reads a whole file in one system call: a read in parts would break off when the process changes its program in between.
 fn read_at_once(path: &str) -> std::io::Result<Vec<u8>> {
     let file = std::fs::File::open(path)?;
     let mut content = vec![0; 16 << 10];
@@ -82,8 +82,8 @@ fn read_at_once(path: &str) -> std::io::Result<Vec<u8>> {
 }
 
 /// Whether a process that just showed no environment will show one: by fields 3, 9, 26, 50 and 51 of `proc_pid_stat(5)`. A program that was
-/// started with an empty one has begun, and there is nothing between its environment's ends. A process that changes its program has no
-/// program yet, or shows an environment by now.
+/// started with an empty environment has begun, and its environment has length zero. A process that changes its program has no program yet,
+/// or shows an environment by now.
 fn is_to_come(pid: u32) -> bool {
     const KERNEL_THREAD: u64 = 0x0020_0000;
     let Ok(stat) = std::fs::read_to_string(format!("/proc/{pid}/stat")) else { return false };
@@ -107,7 +107,7 @@ fn worker_in(environment: &[u8], instance: &str) -> Option<String> {
     })
 }
 
-/// This process, its parent, and so on.
+/// This process and all its ancestors.
 fn ancestry() -> BTreeSet<u32> {
     let mut found = BTreeSet::from([std::process::id()]);
     let mut next = Some(std::process::id());
@@ -168,7 +168,7 @@ mod tests {
                 Environment::Known(shown) => Some(worker_in(&shown, &instance).is_some()),
                 Environment::NotYet => None,
             })
-            // Before its first program it has the environment of this one.
+            // Before its first program it has the environment of this process.
             .skip_while(|carries| !carries)
             .collect();
         child.kill().unwrap();
@@ -185,7 +185,7 @@ mod tests {
         child.stdout.as_mut().unwrap().read_exact(&mut [0]).unwrap();
         let is_nobodys = |pid| matches!(environment_of(pid), Environment::Known(shown) if shown.is_empty());
         assert!(is_nobodys(child.id()));
-        // Closes its input, by which it ends; it is waited for only afterwards.
+        // Closes its standard input, which ends it; it is waited for only afterwards.
         drop(child.stdin.take());
         assert_eq!(child.stdout.as_mut().unwrap().read(&mut [0]).unwrap(), 0);
         std::thread::sleep(std::time::Duration::from_millis(100));

@@ -1,18 +1,18 @@
-//! Tracks which processes belong to which worker, including those in sessions of their own, so that all of a worker ends with it, and
-//! a successor of a process manager that was killed ends what nobody else knows.
+//! Tracks which processes belong to which worker, including those in other sessions, so that all of them end with the worker. The successor
+//! of a killed process manager also ends processes that no list names.
 //!
 //! ```text
 //!   intent in the roster ──▶ fork ──▶ group of cgroup v2 ──▶ `began` in the roster
 //!                             └── from its first instruction on the process and all that it starts carry the marker in their environment
 //! ```
-//! A **group** of cgroup v2 for each worker holds whatever the worker starts, and `cgroup.kill` ends all of it: in the directory that the
-//! config names, else below the process manager's own group where groups may be made there. The **marker** (`marker`) reaches what was
-//! started before the process was in its group, and everything where there are no groups. Only a process that leaves its session *and*
-//! clears its environment, and that without groups, is not known to be of a worker: the process manager is then its parent once the worker
+//! A **cgroup** (v2) for each worker holds all processes that the worker starts, and `cgroup.kill` ends all of them: in the directory that
+//! the config names, else below the process manager's own cgroup where groups may be made there. The **marker** (`marker`) covers processes
+//! that were started before the worker was in its group, and all processes where there are no groups. Only a process that leaves its session
+//! *and* clears its environment, without groups, is not recognized as the worker's: the process manager becomes its parent once the worker
 //! has ended (`orphans`), and ends it when it stops.
 //!
-//! The lock of the roster is held by a child, too, until its program begins: a successor gets it only when every child that was being started
-//! carries its marker.
+//! A child holds the lock of the roster, too, until its program begins: a successor gets the lock only when every child that was being
+//! started carries its marker.
 
 mod marker;
 mod orphans;
@@ -35,9 +35,9 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Processes that are killed are gone within this; one that waits for a broken disk is not.
+/// Killed processes end within this time, unless they wait for a broken disk.
 const KILL_PATIENCE: Duration = Duration::from_secs(2);
-/// The pause between two looks whether they are.
+/// Interval at which that is checked.
 const LOOK_AGAIN: Duration = Duration::from_millis(2);
 
 /// How processes of workers are kept track of.
@@ -49,29 +49,29 @@ pub enum Tracking {
     Auto,
     /// By groups of cgroup v2; without them the process manager does not start.
     Cgroup,
-    /// By their environment, also where there are groups.
+    /// By their environment, even where there are groups.
     Environment,
 }
 
 /// See the module.
 #[derive(Debug, Clone)]
 pub(super) struct Tracker {
-    /// The name of this runtime directory's process manager and its successors.
+    /// The name that this runtime directory's process manager shares with its successors.
     instance: String,
-    /// Where the groups of workers are made.
+    /// The directory in which the workers' groups are made.
     groups: Option<PathBuf>,
-    /// They are in a directory that this made.
+    /// That directory was made by this process.
     made: bool,
-    /// The processes of these users are looked at.
+    /// Only processes of these users are examined.
     users: BTreeSet<u32>,
     children: Option<Children>,
 }
 
 impl Tracker {
-    /// As the config says and this machine has it.
+    /// Starts tracking as the config wants and this machine allows.
     ///
     /// # Errors
-    /// Where the instance's name cannot be kept, or groups are demanded and there are none.
+    /// Where the instance's name cannot be stored, or groups are required and not available.
     pub(super) fn start(config: &ProcessManagerConfig, directory: &RuntimeDirectory) -> anyhow::Result<Tracker> {
         let instance = instance_of(directory)?;
         let groups = match (config.tracking, &config.cgroup) {
@@ -125,27 +125,27 @@ impl Tracker {
         self.groups.as_ref().map(|groups| groups.join(id))
     }
 
-    /// Where groups are made that are for tracking alone.
+    /// The directory for groups that are only for tracking.
     pub(super) fn groups(&self) -> Option<PathBuf> {
         self.groups.clone()
     }
 
-    /// What a worker's processes carry.
+    /// The marker variable of a worker's processes.
     pub(super) fn environment(&self, id: &str) -> (OsString, OsString) {
         marker::of(&self.instance, id)
     }
 
-    /// The children that this process started, where it is asked who the others are.
+    /// The children that this process started, where it has to tell orphans from them.
     pub(super) fn children(&self) -> Option<Children> {
         self.children.clone()
     }
 
-    /// Ends all that is left of a worker. Looks at every process of this machine.
+    /// Ends all remaining processes of a worker. Scans every process of this machine.
     pub(super) fn end_worker(&self, id: &str) {
         self.end_marked(|of| of == id);
     }
 
-    /// Ends what a process manager before this one started and nobody knows: everything but these workers.
+    /// Ends unknown processes that an earlier process manager started: all but those of these workers.
     pub(super) fn end_all_but(&self, kept: &BTreeSet<&str>) {
         let ended = self.end_marked(|of| !kept.contains(of));
         if ended > 0 {
@@ -156,7 +156,7 @@ impl Tracker {
         }
     }
 
-    /// Ends everything, and takes back what it made.
+    /// Ends all processes, and removes the directory that it made.
     pub(super) fn end(&self) {
         self.end_marked(|_| true);
         self.left_groups().for_each(|group| end_group(&group));
@@ -168,7 +168,7 @@ impl Tracker {
         }
     }
 
-    /// Those of a directory that is this process manager's alone.
+    /// The remaining groups in a directory that belongs to this process manager alone.
     fn left_groups(&self) -> impl Iterator<Item = PathBuf> {
         let groups = self.groups.as_ref().filter(|_| self.made);
         let entries = groups.and_then(|groups| std::fs::read_dir(groups).ok());
@@ -176,7 +176,7 @@ impl Tracker {
         entries.filter(|entry| entry.file_type().is_ok_and(|is| is.is_dir())).map(|entry| entry.path())
     }
 
-    /// Kills until nobody is left who could have started more, nor anybody of whom it cannot be said; how many there were.
+    /// Kills until no process is left that could have started more, and none whose marker cannot be read yet; returns their number.
     fn end_marked(&self, of: impl Fn(&str) -> bool) -> usize {
         let (begin, mut ended) = (Instant::now(), BTreeSet::new());
         loop {
@@ -197,10 +197,10 @@ impl Tracker {
     }
 }
 
-/// How the workers of a process manager of this config would be tracked if it ran as this process does, for people.
+/// How workers would be tracked if a process manager with this config ran as this process does, for people.
 ///
 /// # Errors
-/// Why there are no groups, in words.
+/// Why there are no groups, for people.
 pub fn here(config: &ProcessManagerConfig) -> Result<String, String> {
     match (config.tracking, &config.cgroup) {
         (Tracking::Environment, None) => Err("`tracking` says `environment`".to_owned()),
@@ -217,7 +217,7 @@ fn name_of(group: &Path) -> &str {
     group.file_name().and_then(|name| name.to_str()).unwrap_or_default()
 }
 
-/// The same for all process managers of a runtime directory, one after the other.
+/// A name shared by all successive process managers of a runtime directory.
 fn instance_of(directory: &RuntimeDirectory) -> io::Result<String> {
     let file = directory.path().join("process-manager.instance");
     match std::fs::read_to_string(&file) {

@@ -1,5 +1,5 @@
-//! Processes whose parent has ended and that are therefore children of this one: it is their subreaper (`PR_SET_CHILD_SUBREAPER`). Only for a
-//! process that is a process manager and nothing else: whoever is its child and was not started by it comes from a worker.
+//! Orphans: processes whose parent has ended and that become children of this process, their subreaper (`PR_SET_CHILD_SUBREAPER`). Only for a
+//! process that is nothing but a process manager: a child that it did not start itself comes from a worker.
 
 use nix::errno::Errno;
 use nix::sys::prctl::set_child_subreaper;
@@ -24,7 +24,7 @@ impl Children {
         Ok(Children::default())
     }
 
-    /// Starts a process, which is never taken for an orphan meanwhile.
+    /// Starts a process, which is never taken for an orphan in between.
     pub(in crate::process_manager) fn starting<T>(
         &self,
         start: impl FnOnce() -> io::Result<(T, u32)>,
@@ -35,17 +35,17 @@ impl Children {
         Ok(started)
     }
 
-    /// One that was started by this process was waited for.
+    /// A process that this one started has ended and was waited for.
     pub(in crate::process_manager) fn ended(&self, pid: u32) {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).remove(&pid);
     }
 
-    /// Takes leave of orphans that have ended: the kernel keeps them until their parent does.
+    /// Reaps orphans that have ended: the kernel keeps them as zombies until their parent waits for them.
     pub(in crate::process_manager) fn reap(&self) {
         self.orphans(reap_one);
     }
 
-    /// Ends them, and those that become orphans by that.
+    /// Kills all orphans, also those that become orphans by that.
     pub(super) fn end_orphans(&self, patience: Duration) {
         let begin = Instant::now();
         loop {
@@ -63,7 +63,7 @@ impl Children {
         }
     }
 
-    /// Does something with each; how many there are.
+    /// Applies `act` to each orphan; returns their number.
     fn orphans(&self, mut act: impl FnMut(u32)) -> usize {
         let known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let orphans: Vec<u32> =
@@ -73,7 +73,7 @@ impl Children {
     }
 }
 
-/// `kill -9`
+/// `kill -9`.
 pub(super) fn kill(pid: u32) {
     let Some(pid) = i32::try_from(pid).ok().filter(|pid| *pid > 1) else { return };
     match nix::sys::signal::kill(Pid::from_raw(pid), Signal::SIGKILL) {
@@ -82,7 +82,7 @@ pub(super) fn kill(pid: u32) {
     }
 }
 
-/// Where it has not ended nothing happens.
+/// Does nothing where the process has not ended.
 fn reap_one(pid: u32) {
     if let Ok(pid) = i32::try_from(pid) {
         let _ = waitpid(Pid::from_raw(pid), Some(WaitPidFlag::WNOHANG));
@@ -95,7 +95,7 @@ fn children_of(parent: u32) -> Vec<u32> {
     pids.filter(|pid| parent_of(*pid) == Some(parent)).collect()
 }
 
-/// Of `proc_pid_stat(5)`, field 4; nothing of a process that is not there.
+/// Field 4 of `proc_pid_stat(5)`; `None` for a process that does not exist.
 pub(super) fn parent_of(pid: u32) -> Option<u32> {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
     stat.rsplit_once(')')?.1.split_whitespace().nth(1)?.parse().ok()

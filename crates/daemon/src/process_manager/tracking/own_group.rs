@@ -1,12 +1,12 @@
-//! This process's own group of cgroup v2, and a group below it. A unit of systemd with `Delegate=yes` has one that it may divide, and
-//! so have root without systemd and most containers.
+//! This process's own cgroup (v2), and a group below it. A systemd unit with `Delegate=yes` has a cgroup that it may divide, and so
+//! do root without systemd and most containers.
 
 use std::path::{Path, PathBuf};
 
-/// Makes a group of this name below the own one. Groups below that are the caller's.
+/// Makes a group of this name below this process's group. Groups below it are the caller's.
 ///
 /// # Errors
-/// Why there is none, in words.
+/// Why that is not possible, for people.
 pub(super) fn make(name: &str) -> Result<PathBuf, String> {
     let read = |file: &str| std::fs::read_to_string(file).map_err(|error| format!("{file}: {error}"));
     let own = place(&read("/proc/self/mountinfo")?, &read("/proc/self/cgroup")?)
@@ -30,7 +30,7 @@ fn writable(file: &Path) -> bool {
     std::fs::OpenOptions::new().write(true).open(file).is_ok()
 }
 
-/// Where the group of `/proc/self/cgroup` is, by the mounts of `/proc/self/mountinfo`.
+/// The directory of the group in `/proc/self/cgroup`, by the mounts in `/proc/self/mountinfo`.
 fn place(mounts: &str, groups: &str) -> Option<PathBuf> {
     let own = groups.lines().find_map(|line| line.strip_prefix("0::"))?;
     mounts.lines().find_map(|line| {
@@ -38,7 +38,7 @@ fn place(mounts: &str, groups: &str) -> Option<PathBuf> {
         (kind.split(' ').next() == Some("cgroup2")).then_some(())?;
         let mut fields = mount.split(' ').skip(3);
         let (root, place) = (fields.next()?, fields.next()?);
-        // What is mounted may be a part of the hierarchy.
+        // Only part of the hierarchy may be mounted.
         let below = Path::new(own).strip_prefix(root).ok()?;
         Some(Path::new(place).join(below))
     })
