@@ -1,4 +1,5 @@
-//! Access control: roles as in every server ([`ratn_worker::access`]), with what a daemon's config and its resource pool add.
+//! Access control: roles as in every server ([`ratn_worker::access`]), and what a daemon's config and its resource pool add
+//! to them.
 
 pub use ratn_worker::access::*;
 
@@ -11,7 +12,7 @@ impl Check for AccessConfig {
     }
 }
 
-/// Who a caller is to the resource pool.
+/// The caller as the resource pool knows it.
 pub(crate) fn speaker(caller: &Caller) -> Speaker {
     Speaker { name: caller.name.clone(), for_anybody: caller.is_operator() }
 }

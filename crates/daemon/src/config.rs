@@ -13,43 +13,43 @@ use std::sync::Arc;
 /// A config that cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
-    /// It cannot be read.
+    /// The file cannot be read.
     #[error("cannot read {}", file.display())]
     Unreadable {
         /// The file.
         file: PathBuf,
-        /// Why.
+        /// The reason.
         #[source]
         source: std::io::Error,
     },
-    /// It is no TOML, or has a key or a value that it must not have.
+    /// The file is not valid TOML, or has a key or a value that is not allowed.
     #[error("{}: {problem}", file.display())]
     Malformed {
         /// The file.
         file: PathBuf,
-        /// What and where, with the line.
+        /// The problem and its place, with the line number.
         problem: String,
     },
     /// A value breaks a rule.
     #[error("`{key}`: {rule}")]
     Rule {
-        /// Which key.
+        /// The key.
         key: String,
-        /// The rule, and what the value is.
+        /// The rule, and the value that breaks it.
         rule: String,
     },
 }
 
 /// A config with rules beyond its types.
 pub trait Check {
-    /// Says which rule is broken.
+    /// Reports the first rule that is broken.
     ///
     /// # Errors
-    /// [`ConfigError::Rule`] of the first.
+    /// [`ConfigError::Rule`] of that rule.
     fn check(&self) -> Result<(), ConfigError>;
 }
 
-/// What keeps a daemon's state.
+/// Storage engine of a daemon's state.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Engine {
@@ -60,16 +60,16 @@ pub enum Engine {
     Etcd,
 }
 
-/// Where and how a daemon keeps its state. All keys are optional; of etcd's, `endpoints` and `prefix` are needed with that engine, and
-/// mean nothing without.
+/// Where and how a daemon keeps its state. All keys are optional, except that `engine = "etcd"` needs `endpoints` and `prefix`; other
+/// engines refuse etcd's keys.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct StorageConfig {
     /// `log` or `etcd`.
     pub engine: Engine,
-    /// The members of etcd.
+    /// Addresses of the etcd members.
     pub endpoints: Vec<Endpoint>,
-    /// What stands before every key in etcd, as `/ratn/cell-7`; each role has its own keys behind it.
+    /// Prefix of every key in etcd, such as `/ratn/cell-7`; each role has its own keys under it.
     pub prefix: String,
     /// The file with the authority that signed the certificates of etcd's members (PEM).
     pub ca: Option<PathBuf>,
@@ -77,15 +77,15 @@ pub struct StorageConfig {
     pub cert: Option<PathBuf>,
     /// The file with its private key (PEM).
     pub key: Option<PathBuf>,
-    /// Leads also where an older state of etcd was restored, once: what was acknowledged since then is gone. The number that the daemon
-    /// says when it refuses it; it means nothing to the next restore.
+    /// Lets the daemon lead once although an older state of etcd was restored and acknowledged changes are lost. The value is the
+    /// number that the daemon prints when it refuses to lead; it is not valid for the next restore.
     pub accept_restored: Option<u64>,
-    /// A directory of its own; `state/<role>` in the runtime directory unless given.
+    /// A directory for this state alone; by default `state/<role>` in the runtime directory.
     pub directory: Option<PathBuf>,
-    /// When an answer may leave: `none` at once, `group` when what it tells of is on the disk (many share a sync), `each` likewise,
-    /// with a sync for every change.
+    /// When an answer may be sent: `none` at once, `group` after its records are synced (many answers share a sync), `each` likewise,
+    /// with one sync for every change.
     pub durability: Durability,
-    /// After so many bytes of changes (and twice as many as the last snapshot had) a snapshot takes their place.
+    /// A snapshot replaces the log after this many bytes of changes, and after at least twice the size of the last snapshot.
     pub compact_bytes: u64,
 }
 
@@ -107,15 +107,15 @@ impl Default for StorageConfig {
 }
 
 impl StorageConfig {
-    /// What a role's state is kept in, for who copies it.
+    /// The store that keeps a role's state, for commands that copy it.
     ///
     /// # Errors
-    /// Where a file of it cannot be read.
+    /// Where one of its files cannot be read.
     pub fn store(&self, role: &str) -> anyhow::Result<Arc<dyn Store>> {
         Ok(match self.engine {
             Engine::Log => {
                 let directory = self.directory.clone().unwrap_or_else(|| role.into());
-                // A copy is on the disk when it counts, whatever its daemon waits for later.
+                // A copy counts only when it is on the disk, whatever durability its daemon uses later.
                 let config = StorageConfig { durability: Durability::Group, ..self.clone() };
                 Arc::new(crate::durable_actor::Journal::log(&config, &directory))
             }
@@ -123,7 +123,7 @@ impl StorageConfig {
         })
     }
 
-    /// Who leads, as etcd says: where and what it is. Nobody where the state is in files. Blocks.
+    /// The current leader according to etcd: its address and its name. `None` where the state is in files. Blocks.
     ///
     /// # Errors
     /// Where etcd does not answer, or a file for its TLS cannot be read.
@@ -138,7 +138,7 @@ impl StorageConfig {
         self.endpoints.iter().all(|endpoint| matches!(endpoint, Endpoint::Tls { .. }))
     }
 
-    /// Where a role keeps its state.
+    /// The directory in which a role keeps its state.
     pub fn directory_of(&self, role: &str, runtime_directory: &Path) -> PathBuf {
         self.directory.clone().unwrap_or_else(|| state_directory(runtime_directory).join(role))
     }
@@ -178,12 +178,12 @@ impl Check for StorageConfig {
     }
 }
 
-/// Where state is kept unless said otherwise: in a runtime directory, in a folder for each role.
+/// The default directory of durable state: a folder of the runtime directory, with a folder for each role.
 pub fn state_directory(runtime_directory: &Path) -> PathBuf {
     runtime_directory.join("state")
 }
 
-/// Reads and checks a file that holds one daemon's config.
+/// Reads and checks the config file of a daemon.
 ///
 /// # Errors
 /// [`ConfigError`] of what is wrong with it.

@@ -1,4 +1,5 @@
-//! The part of a provider's link that hears what is missing and what is held, and says why there is no more of it.
+//! The part of a provider's link that receives demands and holdings from the resource manager, and reports why the provider cannot
+//! make more resources.
 
 use ratn_model::value::Value;
 use ratn_proto::types::{Demand, Provision, Resource, ResourceEventKind, ResourceUpdate};
@@ -9,53 +10,53 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 
-/// When to ask again after the watch broke.
+/// Delay before a broken watch is opened again.
 const AGAIN_AFTER: Duration = Duration::from_millis(250);
 
-/// Characters of a reason that are said; what they are is in the provider's log.
+/// Maximum length of a reported reason in characters; the full reason is in the provider's log.
 const REASON_LENGTH: usize = 250;
 
-/// Of which kinds there can be no more for now.
+/// The kinds of which the provider can make no more for now.
 pub(crate) type Shortages = BTreeMap<String, Shortage>;
 
-/// Of a kind there can be no more than so many for now, and why.
+/// The most resources of a kind that are possible for now, and why.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Shortage {
-    /// Those there are count.
+    /// Includes the resources that exist already.
     pub most: u32,
     /// For people.
     pub reason: String,
 }
 
-/// Somebody holds a resource now, or nobody any more.
+/// A change of a resource: it is held now, or no longer held.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Use {
     pub(crate) id: String,
     pub(crate) held: bool,
 }
 
-/// What goes from and to the provider.
+/// The channels between the link and the provider.
 pub(crate) struct DemandLink {
     pub(crate) wanted: WantedLink,
-    /// Hears who of its kinds is held, its own and those of others.
+    /// Receives which resources of the provider's kinds are held: its own and those of other providers.
     pub(crate) used: mpsc::Sender<Use>,
-    /// What of that it has heard.
+    /// The holdings that the link has heard of so far.
     pub(crate) uses: Uses,
 }
 
-/// The part of it about what is missing.
+/// The part of the link that deals with demand.
 pub(crate) struct WantedLink {
-    /// What it can provide, by kind.
+    /// The resources that the provider can make, by kind.
     pub(crate) kinds: BTreeMap<String, Provision>,
-    /// What all of it has in common.
+    /// Attributes that all of them have.
     pub(crate) attributes: BTreeMap<String, Value>,
-    /// Hears what is missing.
+    /// Receives the demand.
     pub(crate) heard: mpsc::Sender<Vec<Demand>>,
     pub(crate) shortages: watch::Receiver<Shortages>,
 }
 
 impl DemandLink {
-    /// Goes on for as long as it is polled. What was missing counts until it is heard that it is not.
+    /// Runs for as long as it is polled. A demand stays in force until the resource manager reports that it is gone.
     pub(crate) async fn follow(&mut self, channels: &Channels, endpoint: &Endpoint, session: &Session) {
         let DemandLink { wanted, used, uses } = self;
         let kinds: Vec<String> = wanted.kinds.keys().cloned().collect();
@@ -111,7 +112,7 @@ impl WantedLink {
     }
 }
 
-/// From who holds what now on.
+/// Follows which resources are held, from now on.
 async fn follow_uses(
     channels: &Channels,
     endpoint: &Endpoint,
@@ -134,15 +135,15 @@ async fn follow_uses(
     Ok(())
 }
 
-/// Who is held, as far as it was heard. Pure.
+/// The resources that are held, as far as the link has heard. Pure.
 #[derive(Debug, Default)]
 pub(crate) struct Uses {
     held: BTreeSet<String>,
 }
 
 impl Uses {
-    /// What an update of the watch says of who is held. What is not there any more is held by nobody, also where it went while nobody
-    /// watched.
+    /// The changes of holdings in an update of the watch. A resource that no longer exists is held by nobody, also where it vanished
+    /// while nobody watched.
     fn heard(&mut self, update: ResourceUpdate) -> Vec<Use> {
         let is_held = |resource: &Resource| !resource.holdings.is_empty();
         let changed: Vec<Use> = match update {
@@ -171,7 +172,7 @@ impl Uses {
     }
 }
 
-/// Last words of a worker may have many.
+/// The last output of a worker may have many lines.
 fn in_one_line(reason: &str) -> String {
     reason.chars().map(|c| if c.is_control() { ' ' } else { c }).take(REASON_LENGTH).collect()
 }
@@ -227,7 +228,7 @@ mod tests {
             "the lease lost it"
         );
         assert_eq!(heard(&mut uses, event(Deleted, planner("p1", true))), [("p1".to_owned(), false)]);
-        // It is offered again, and leased again.
+        // The resource is offered again, and leased again.
         assert!(heard(&mut uses, event(Created, planner("p1", false))).iter().all(|(_, held)| !held));
         assert_eq!(heard(&mut uses, event(Leased, planner("p1", true))), [("p1".to_owned(), true)]);
     }

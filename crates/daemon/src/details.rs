@@ -8,13 +8,13 @@ use tonic_types::{ErrorDetails, StatusExt};
 /// The domain of every reason.
 const DOMAIN: &str = "ratn";
 
-/// A status that says why in one word for programs and in a sentence for people.
+/// A status with a reason code for programs and a sentence for people.
 pub(crate) fn status(code: Code, reason: &str, message: impl Into<String>) -> Status {
     let details = ErrorDetails::with_error_info(reason, DOMAIN, []);
     Status::with_error_details(code, message, details)
 }
 
-/// The same, with what programs want to know of it, by name.
+/// As `status`, with details for programs, by name.
 pub(crate) fn status_about<const N: usize>(
     code: Code,
     reason: &str,
@@ -25,14 +25,14 @@ pub(crate) fn status_about<const N: usize>(
     Status::with_error_details(code, message, details)
 }
 
-/// A status of something that may go better after a while.
+/// A status of a call that may succeed when it is retried after a while.
 pub(crate) fn retry_later(code: Code, reason: &str, message: impl Into<String>, after: Duration) -> Status {
     let mut details = ErrorDetails::with_error_info(reason, DOMAIN, []);
     details.set_retry_info(Some(after));
     Status::with_error_details(code, message, details)
 }
 
-/// The state can no longer be written down. It says what to do; asking again helps when that is done.
+/// The state can no longer be written. The message says what to do; a retry helps after that.
 pub(crate) fn of_fault(fault: &dyn std::error::Error) -> Status {
     let mut message = fault.to_string();
     if let Some(source) = fault.source() {
@@ -41,7 +41,7 @@ pub(crate) fn of_fault(fault: &dyn std::error::Error) -> Status {
     status(Code::Unavailable, "STORAGE_FAILED", message)
 }
 
-/// The word for programs; where there is none, the code's.
+/// The reason code for programs; where there is none, the gRPC code.
 pub(crate) fn reason(status: &Status) -> String {
     let details = status.get_error_details();
     let said = details.error_info().map(|info| info.reason.clone());

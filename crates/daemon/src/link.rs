@@ -16,11 +16,11 @@ use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
-/// A part of a daemon, for its log.
+/// The name of this part of a daemon in its log.
 pub(crate) const LINK: &str = "the link to the resource manager";
-/// After so long without a manager the log says so, again and again; the link goes on waiting.
+/// A warning is logged each time that this passes without a manager; the link goes on waiting.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// The pause between two looks whether the manager has another address, and whether a resource is still to be offered.
+/// Interval at which the link checks whether the manager has another address, and whether a resource is still to be offered.
 const LOOK_INTERVAL: Duration = Duration::from_millis(250);
 
 /// The resources that the provider wants to offer, by id.
@@ -43,7 +43,7 @@ pub(crate) enum OfferEvent {
 #[derive(Debug)]
 pub(crate) struct OfferLifecycle {
     pub(crate) events: mpsc::Sender<OfferEvent>,
-    /// Those of the wanted that are withdrawn as soon as nobody holds them.
+    /// The wanted resources that are withdrawn as soon as nobody holds them.
     pub(crate) draining: watch::Receiver<BTreeSet<String>>,
 }
 
@@ -51,7 +51,7 @@ pub(crate) struct OfferLifecycle {
 #[derive(Debug)]
 pub(crate) struct LastingSession {
     pub(crate) id: String,
-    /// Makes another id where this one is another caller's. It is answered once everybody who has to know it does.
+    /// Requests another id where this one belongs to another caller. The answer comes once everybody who has to know the new id does.
     pub(crate) renewals: mpsc::Sender<oneshot::Sender<String>>,
 }
 
@@ -60,7 +60,7 @@ pub(crate) struct LastingSession {
 pub(crate) struct Manager {
     pub(crate) configured: Option<Endpoint>,
     pub(crate) directory: RuntimeDirectory,
-    /// What it is shown, and by what it is trusted.
+    /// The certificate shown to the manager, and the authority that the manager's certificate has to come from.
     pub(crate) tls: ClientTls,
 }
 
@@ -120,7 +120,7 @@ impl Link {
     pub(crate) async fn keep(mut self, shutdown: CancellationToken) {
         let channels = Channels::new(&self.manager.tls);
         let mut demand = self.demand.take();
-        // What is wanted from the beginning on, an earlier process may have offered.
+        // Resources that are wanted from the beginning may have been offered by an earlier process.
         let mut before = self.wanted.borrow().clone();
         loop {
             let endpoint = tokio::select! {
@@ -150,7 +150,7 @@ impl Link {
         }
     }
 
-    /// Returns when the manager has another address. Some of what is offered may have been offered before, and leased.
+    /// Returns when the manager has another address. Some of the resources may have been offered, and leased, before.
     async fn keep_at(
         &mut self,
         channels: &Channels,
@@ -165,12 +165,12 @@ impl Link {
         }
         let provider = Provider::start(channels, endpoint, session)?;
         let found = session.state().borrow().found;
-        // What the provider has been asked to offer, and offers by itself as soon as it can.
+        // The resources that the provider was asked to offer; it keeps trying by itself.
         let mut asked = self.take_over(&provider, session.id(), found, before).await?;
         let mut offered = Wanted::new();
         let mut refused = Wanted::new();
         loop {
-            // Before what is wanted: what was withdrawn while it drained leaves both, in the other order.
+            // Read before `wanted`: a resource that was withdrawn while draining leaves both, in the other order.
             let draining = self.draining();
             let wanted = self.wanted.borrow_and_update().clone();
             for id in asked.extract_if(.., |id| !wanted.contains_key(id)) {
@@ -237,9 +237,9 @@ impl Link {
         }
     }
 
-    /// Takes over what an earlier process offered in the same session, and withdraws what this one does not want; the ids of what is wanted
-    /// and was found. The provider knows what may be leased before the manager is asked anything more, so that a session that ends meanwhile
-    /// takes nothing with it unnoticed.
+    /// Takes over what an earlier process offered in the same session, and withdraws what this one does not want. Returns the ids of the wanted
+    /// resources that were found. The provider learns what may be leased before the manager is asked anything else, so that the end of the
+    /// session meanwhile is noticed for every leased resource.
     async fn take_over(
         &mut self,
         provider: &Provider,
@@ -255,7 +255,7 @@ impl Link {
         let ids: BTreeSet<String> = left.iter().map(|resource| resource.id.clone()).collect();
         let as_wanted = |left: Resource| Some((wanted.get(&left.id)?.clone(), left.standstill()));
         provider.offered_before(left.into_iter().filter_map(as_wanted).collect()).await;
-        // Who held something that the manager has lost may not have heard that yet.
+        // Holders of a resource that the manager has lost may not have heard of that yet.
         let lost = before.values().filter(|resource| !ids.contains(&resource.id));
         provider.may_move(&lost.cloned().collect::<Vec<_>>()).await;
         for resource in unwanted {
@@ -299,7 +299,7 @@ async fn drains_changed(lifecycle: &mut Option<OfferLifecycle>) {
     }
 }
 
-/// Follows the demand, for a provider that makes resources on demand. Does not end.
+/// Follows the demand, for a provider that makes resources on demand. Never returns.
 async fn follow(demand: &mut Option<DemandLink>, channels: &Channels, endpoint: &Endpoint, session: &Session) {
     match demand {
         Some(demand) => demand.follow(channels, endpoint, session).await,

@@ -1,4 +1,4 @@
-//! Answers in pages: whatever can be stored can be told of, however much there is of it.
+//! Answers in pages: any state that can be stored can also be read, however large it is.
 //!
 //! ```text
 //!   page_bytes = 0: all at once, or RESOURCE_EXHAUSTED (TOO_LARGE) that says to ask in pages
@@ -11,25 +11,25 @@ use ratn_proto::convert::label;
 use ratn_proto::{MAX_MESSAGE_BYTES, MAX_PAGE_BYTES};
 use tonic::{Code, Status};
 
-/// Room that a message needs beside what it repeats.
+/// Bytes that a message needs apart from its repeated items.
 const ENVELOPE_BYTES: usize = 64 * 1024;
 
 /// How much of an answer is wanted at once.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Page {
-    /// Nothing where all of it is.
+    /// `None` for the whole answer.
     bytes: Option<usize>,
 }
 
 impl Page {
-    /// Of what a request says.
+    /// The page that a request asks for.
     pub(crate) fn of(bytes: u32, token: &str) -> Page {
         let asked = usize::try_from(bytes).unwrap_or(MAX_PAGE_BYTES).min(MAX_PAGE_BYTES);
         let asked = if asked == 0 { MAX_PAGE_BYTES } else { asked };
         Page { bytes: (bytes > 0 || !token.is_empty()).then_some(asked) }
     }
 
-    /// Takes from what there is until the page is full. Whether something is left.
+    /// Takes items until the page is full. Returns whether any are left.
     pub(crate) fn fill<T: Message>(
         self,
         items: impl IntoIterator<Item = T>,
@@ -49,7 +49,7 @@ impl Page {
     }
 }
 
-/// What is on a page.
+/// The items of a page.
 #[derive(Debug)]
 pub(crate) struct Filled<T> {
     pub(crate) items: Vec<T>,
@@ -62,12 +62,12 @@ impl<T> Default for Filled<T> {
     }
 }
 
-/// What a field takes beside its message.
+/// Bytes of a field apart from its message.
 const ITEM_BYTES: usize = 8;
 
-/// A snapshot in parts of at most a page each, and whether another one follows: at least one, which may be empty. A part is made by `make` when it is
-/// asked for, so a client that does not read has one of them at the most. A client that takes no parts gets all in one part, where that
-/// fits into a message.
+/// A snapshot in parts of at most a page each, each with whether another one follows. There is at least one part, which may be empty. `make` makes a
+/// part when it is asked for, so at most one part is in memory for a client that does not read. A client that does not support parts gets everything
+/// in one part, where that fits into a message.
 pub(crate) fn snapshot_parts<T>(
     in_parts: bool,
     mut make: impl FnMut(Page, &mut Filled<T>) -> Result<bool, Status>,
@@ -86,16 +86,16 @@ pub(crate) fn snapshot_parts<T>(
     })
 }
 
-/// As many from the first on as a page has room for.
+/// As many of the first items as a page has room for.
 pub(crate) fn first<T: Message>(items: Vec<T>) -> Vec<T> {
     let mut filled = Filled::default();
     let page = Page { bytes: Some(MAX_PAGE_BYTES) };
-    // A page that has a length is never too large.
+    // A page with a byte limit is never too large.
     let _ = page.fill(items, &mut filled);
     filled.items
 }
 
-/// What a token says to a call that asks for the same as before: a revision, and how many were on the pages before.
+/// The place in a token, for a call that asks for the same as before: a revision, and the number of items on the pages before.
 pub(crate) fn place(token: &str, asked: &impl Message) -> Result<Option<(u64, usize)>, Status> {
     let place = behind(token, asked)?;
     if place.is_empty() {
@@ -105,19 +105,19 @@ pub(crate) fn place(token: &str, asked: &impl Message) -> Result<Option<(u64, us
     read().map(Some).ok_or_else(no_token)
 }
 
-/// The token of the page behind, where there is one; as [`token_behind`].
+/// The token of the next page, where there is one; as [`token_behind`].
 pub(crate) fn token(more: bool, revision: u64, seen: usize, asked: &impl Message) -> String {
     let place = more.then(|| format!("{revision}:{seen}"));
     token_behind(place.as_deref(), asked)
 }
 
-/// The token of the page behind the one that ends with this id, where there is one. Only a call that asks for the same goes on with it: `asked` is
-/// the request without what it says of pages.
+/// The token of the page behind the one that ends with this id, where there is one. The token is only valid for the same request: `asked` is the
+/// request without its paging fields.
 pub(crate) fn token_behind(last: Option<&str>, asked: &impl Message) -> String {
     last.map_or_else(String::new, |last| format!("{:016x}:{last}", seal(last, asked)))
 }
 
-/// The id behind which a token goes on; empty for the first page.
+/// The id after which a token continues; empty for the first page.
 pub(crate) fn behind<'a>(token: &'a str, asked: &impl Message) -> Result<&'a str, Status> {
     if token.is_empty() {
         return Ok("");
@@ -127,7 +127,7 @@ pub(crate) fn behind<'a>(token: &'a str, asked: &impl Message) -> Result<&'a str
     own.map(|(_, last)| last).ok_or_else(no_token)
 }
 
-/// FNV-1a of what is asked, in which words, and an id: it tells a token of ours from another text, and protects nothing.
+/// FNV-1a hash of the request's type, its content and an id: it tells a token of ours from any other text, and is no protection.
 fn seal<T: Message>(last: &str, asked: &T) -> u64 {
     let question = std::any::type_name::<T>().bytes().chain(asked.encode_to_vec());
     let bytes = question.chain([0]).chain(last.bytes());
@@ -139,7 +139,7 @@ fn no_token() -> Status {
     status(Code::InvalidArgument, "MALFORMED", message)
 }
 
-/// An answer that does not fit into one message.
+/// The refusal of an answer that does not fit into one message.
 pub(crate) fn too_large() -> Status {
     let message = format!(
         "the answer has more than the {MAX_MESSAGE_BYTES} bytes of a message: ask for it in pages (page_bytes, for a watch \
@@ -148,7 +148,7 @@ pub(crate) fn too_large() -> Status {
     status(Code::ResourceExhausted, "TOO_LARGE", message)
 }
 
-/// An answer that has no pages: as it is where it fits into one message, else refused with what to ask for instead.
+/// An answer that has no pages: unchanged where it fits into one message, otherwise a refusal that names the alternative.
 pub(crate) fn whole<T: Message>(answer: T, what: &str, instead: &str) -> Result<T, Status> {
     let bytes = answer.encoded_len();
     if bytes <= MAX_MESSAGE_BYTES {
@@ -184,7 +184,7 @@ mod tests {
     fn an_answer_without_pages_is_refused_where_it_is_more_than_a_message() {
         let whole = Page::of(0, "");
         let edge = MAX_MESSAGE_BYTES - ENVELOPE_BYTES - ITEM_BYTES;
-        // A text has a tag and its length beside its letters.
+        // A string field has a tag and its length in addition to its characters.
         let at_edge = |more: usize| "x".repeat(edge - 5 + more);
         assert_eq!(at_edge(0).encoded_len(), edge);
         assert!(!whole.fill([at_edge(0)], &mut Filled::default()).unwrap());
@@ -201,7 +201,7 @@ mod tests {
             contradiction: Some(v1::Contradiction { fact: Some(named(bytes)), ..Default::default() }),
         };
         fn check<T: Message>(with: impl Fn(usize) -> T) {
-            // Near the edge the length of a field takes as many bytes as at the edge.
+            // Near the limit the length of a field takes as many bytes as at the limit.
             let near = MAX_MESSAGE_BYTES - 1_000;
             let edge = near + (MAX_MESSAGE_BYTES - with(near).encoded_len());
             assert_eq!(whole(with(edge), "it", "ask for less").unwrap().encoded_len(), MAX_MESSAGE_BYTES);

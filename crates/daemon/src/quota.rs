@@ -4,13 +4,13 @@
 //!   call ──admit(caller, path)──▶ Permit, held until the answer has been sent
 //!                           └───▶ RESOURCE_EXHAUSTED: which quota, and whose
 //! ```
-//! What is made of answers and not sent yet, because who asked does not read it, counts in bytes; so does what a watch has still to tell of
-//! the beginning. An answer that is too much is refused, and what was done for it stands: who asks again hears of it.
+//! Bytes count that are in answers which were made and not sent yet because the caller does not read; so do the bytes of the first part of a
+//! watch. An answer that is too much is refused, but its request was performed: a caller who asks again learns of it.
 //!
-//! Quotas are by name ([`Caller::name`]): all who are anonymous are one caller. Operators have none, and a share of what all others can take
-//! together is kept for them. Sessions and acquires that wait have theirs in the pool ([`ratn_resources::Limits`]). Calls of health and
-//! reflection count like all others, but `HEALTH_CHECKS_PER_S` checks of a caller are answered whatever else it does: whoever watches
-//! over the process may have the same name as a client that does too much.
+//! Quotas are by name ([`Caller::name`]): all anonymous callers are one. Operators have no quotas, and a share of what all others can use
+//! together is kept for them. Sessions and waiting acquires have quotas in the pool ([`ratn_resources::Limits`]). Health and reflection
+//! calls count like all others, but `HEALTH_CHECKS_PER_S` health checks of a caller are answered whatever else it does: a supervisor of the
+//! process may have the same name as a client that does too much.
 
 use crate::access::{Caller, HEALTH_CHECK};
 use crate::config::{Check, ConfigError, rule};
@@ -30,31 +30,31 @@ use tonic::{Code, Status};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct QuotaConfig {
-    /// Calls of one caller in a second; twice as many may come at once.
+    /// Calls of one caller per second; twice as many may come in a burst.
     pub calls_per_s: u32,
-    /// Calls of one caller under way, waiting acquires and streams included.
+    /// Calls of one caller in progress, waiting acquires and streams included.
     pub calls: usize,
     /// Watches of one caller.
     pub watches: usize,
-    /// Watches of all callers that are no operators.
+    /// Watches of all callers that are not operators.
     pub watches_of_all: usize,
-    /// Bytes of answers to one caller that wait for it to read them.
+    /// Bytes of answers to one caller that it has not read yet.
     pub unread_bytes: usize,
-    /// Bytes of answers to all callers that are no operators.
+    /// Bytes of unread answers to all callers that are not operators.
     pub unread_bytes_of_all: usize,
-    /// Connections at once: the one that has said nothing for longest gives way to a new one. Fewer than the process may open files.
+    /// Open connections: a new one replaces the one that has been silent for longest. Has to be below the process's limit of open files.
     pub connections: usize,
-    /// Connections of one user of this machine, or from one host, in a second; as many as `connections` may come at once.
+    /// New connections per second of one user of this machine or one host; as many as `connections` may come in a burst.
     pub connections_per_s: u32,
-    /// Connections of one caller with calls under way.
+    /// Connections of one caller with calls in progress.
     pub connections_in_use: usize,
-    /// Of `connections`: only operators' and new connections have them, for all others leave so many without calls under way. A sixth
-    /// unless given.
+    /// Part of `connections` that only operators and new connections can use: the others leave this many without calls in progress. By
+    /// default a sixth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub connections_for_operators: Option<usize>,
-    /// From a connection to its first call, the handshake of TLS included, in milliseconds.
+    /// Maximum time from a connection to its first call, the TLS handshake included, in milliseconds.
     pub first_call_ms: u64,
-    /// A connection without a call under way is closed after so long, in milliseconds.
+    /// A connection without a call in progress is closed after this time, in milliseconds.
     pub idle_ms: u64,
 }
 
@@ -111,14 +111,14 @@ impl Check for QuotaConfig {
     }
 }
 
-/// Operators have this part of all connections unless the config says otherwise.
+/// Operators have one part in this many of all connections, unless the config says otherwise.
 const OPERATORS_PART: usize = 6;
-/// Health checks of one caller in a second that are answered also where its quotas are used up.
+/// Health checks of one caller per second that are answered even where its quotas are used up.
 const HEALTH_CHECKS_PER_S: u32 = 20;
-/// When whoever has too much may ask again.
+/// Retry delay of a caller that is over its quota.
 const RETRY_DELAY: Duration = Duration::from_millis(200);
 
-/// What callers have now. A handle: clones share everything.
+/// Current use by callers. A handle: clones share everything.
 #[derive(Debug, Clone)]
 pub(crate) struct Quotas {
     config: QuotaConfig,
@@ -145,7 +145,7 @@ struct UseOfOne {
     checks: TokenBucket,
 }
 
-/// How many may come at once of so many a second.
+/// Burst size at this rate per second.
 fn at_once(per_s: u32) -> u32 {
     per_s.saturating_mul(2)
 }
@@ -155,7 +155,7 @@ impl Quotas {
         Quotas { config, use_of: Arc::default(), metrics }
     }
 
-    /// One more call of a caller, until the permit is dropped; none is needed by an operator, and by a health check beyond the quotas.
+    /// Counts a call of a caller until the permit is dropped. Operators and health checks beyond the quotas need no permit.
     pub(crate) fn admit(&self, caller: &Caller, path: &str, now: Instant) -> Result<Option<Permit>, Status> {
         if caller.is_operator() {
             return Ok(None);
@@ -178,8 +178,7 @@ impl Quotas {
         Ok(Some(Permit::new(Held { quotas: self.clone(), caller: caller.name.clone(), is_watch })))
     }
 
-    /// So many bytes more that wait for a caller to read them, until the permit is dropped; few of one call, and those of operators, do not
-    /// count.
+    /// Counts bytes that a caller has not read, until the permit is dropped. Small answers and those to operators do not count.
     pub(crate) fn unread(&self, caller: &Caller, bytes: usize, now: Instant) -> Result<Option<Permit>, Status> {
         if caller.is_operator() || bytes < UNREAD_COUNTED_FROM {
             return Ok(None);
@@ -206,7 +205,7 @@ impl Quotas {
         Ok(Some(Permit::new(HeldBytes { quotas: self.clone(), caller: caller.name.clone(), bytes })))
     }
 
-    /// Whether a caller may have one call more.
+    /// Whether a caller may have another call.
     fn within(&self, one: &mut UseOfOne, all_watches: usize, is_watch: bool, now: Instant) -> Result<(), Beyond> {
         let QuotaConfig { calls_per_s, calls, watches, watches_of_all, .. } = self.config;
         let beyond = |key, what, most| Err(Beyond { key, what, most });
@@ -242,7 +241,7 @@ impl Use {
     }
 }
 
-/// Bytes that wait for their reader.
+/// Unread bytes of an answer.
 struct HeldBytes {
     quotas: Quotas,
     caller: Arc<str>,
@@ -259,7 +258,7 @@ impl Drop for HeldBytes {
     }
 }
 
-/// A call that is under way.
+/// A call in progress.
 struct Held {
     quotas: Quotas,
     caller: Arc<str>,
@@ -280,18 +279,18 @@ impl Drop for Held {
     }
 }
 
-/// Callers without a call under way that are remembered, for how often they call.
+/// Maximum number of callers without a call in progress whose call rate is remembered.
 const MOST_REMEMBERED: usize = 1_024;
 
-/// Whether the answer is a stream that tells of changes for as long as the caller likes.
+/// Whether the answer is a stream of changes that lasts for as long as the caller likes.
 fn is_watch(path: &str) -> bool {
     path.rsplit('/').next().is_some_and(|method| method.starts_with("Watch"))
 }
 
-/// The keys of the quotas that are not of one caller.
+/// The keys of the quotas that all callers share.
 const WATCHES_OF_ALL: &str = "watches_of_all";
 const UNREAD_OF_ALL: &str = "unread_bytes_of_all";
-/// What is less counts as a call alone: `calls` bounds it, and whoever reads nothing is still told that.
+/// Smaller answers do not count in bytes: `calls` bounds them, and a caller who reads nothing still gets its refusal.
 const UNREAD_COUNTED_FROM: usize = 16 << 10;
 
 /// A quota that is used up.
@@ -303,12 +302,12 @@ struct Beyond {
 }
 
 impl Beyond {
-    /// In one word, for programs.
+    /// The reason code for programs.
     fn reason(self) -> String {
         format!("QUOTA_{}", self.key.to_uppercase())
     }
 
-    /// What its caller is told.
+    /// The refusal for its caller.
     fn of(self, caller: &str) -> Status {
         let Beyond { key, what, most } = self;
         let whose = if [WATCHES_OF_ALL, UNREAD_OF_ALL].contains(&key) { "all who are no operators" } else { caller };
@@ -334,8 +333,8 @@ mod tests {
         Caller { name: name.into(), roles: [role].as_slice().into() }
     }
 
-    /// Each quota, the calls that it bounds, and who is refused in which words: admitted at its edge, refused one past it, and admitted
-    /// again when one has ended.
+    /// Each quota, the calls that it bounds, and the text of the refusal: admitted at the limit, refused one past it, and admitted again
+    /// when a call has ended.
     #[test]
     fn every_quota_at_its_edge_and_one_past_it() {
         let config =

@@ -1,6 +1,6 @@
 //! Reloading the config at SIGHUP: which settings change without a restart, and which do not.
 
-/// Keys of a config that a running daemon takes over, with all below them.
+/// Keys of a config that a running daemon reloads, with all keys below them.
 const LIVE: [&str; 6] = [
     "service.log.filter",
     "service.access",
@@ -10,8 +10,8 @@ const LIVE: [&str; 6] = [
     "resource-manager.max_watchers",
 ];
 
-/// Keys that differ and that a running daemon does not take over, in order. Tables are compared key by key, all else as a whole. Of
-/// a table that is not there, and of which something is taken over, every key is different.
+/// Keys that differ and need a restart, sorted. Tables are compared key by key, everything else as a whole. A table that only one
+/// config has, and in which some keys can be reloaded, is compared key by key, too.
 pub fn need_a_restart(running: &toml::Table, wanted: &toml::Table) -> Vec<String> {
     let mut different = Vec::new();
     compare("", running, wanted, &mut different);
@@ -23,7 +23,7 @@ fn is_within(key: &str, whole: &str) -> bool {
     key.strip_prefix(whole).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
 }
 
-/// Whether something of a table is taken over.
+/// Whether a running daemon reloads any key of a table.
 fn has_live(table: &str) -> bool {
     LIVE.iter().any(|live| is_within(live, table))
 }

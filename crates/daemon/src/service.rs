@@ -1,4 +1,4 @@
-//! What every daemon has around its own service: access control, logs, metrics, the drain.
+//! What every daemon has around its own service: access control, logs, metrics, draining.
 //!
 //! ```text
 //!   [service] of the config ──▶ ServiceConfig ──serving(role)──▶ ratn_worker::server::Serving (exposure, gate, drain)
@@ -29,25 +29,25 @@ use tonic::{Code, Status};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ServiceConfig {
-    /// Serve addresses beyond loopback also without TLS: the network itself is trusted.
+    /// Serves addresses beyond loopback even without TLS: the network itself is trusted.
     pub insecure: bool,
-    /// Calls under way at the end are given this long, in milliseconds.
+    /// Grace period for calls in progress at the end, in milliseconds.
     pub drain_ms: u64,
     /// Logs.
     pub log: LogConfig,
-    /// Append every mutation to this file, one JSON object a line.
+    /// Appends every mutation to this file, one JSON object per line.
     pub audit_file: Option<PathBuf>,
-    /// Where each role shows its metrics, `resource-manager = "127.0.0.1:9464"`; a role that is not named shows none.
+    /// Address of each role's metrics, such as `resource-manager = "127.0.0.1:9464"`; a role that is not listed serves none.
     pub metrics: BTreeMap<String, SocketAddr>,
-    /// With it every TCP address is served with TLS, and only to who shows a certificate.
+    /// Serves every TCP address with TLS, only to clients with a certificate.
     pub tls: Option<ServerTls>,
     /// Who may connect to a Unix socket.
     pub socket: SocketAccess,
     /// Who may do what.
     pub access: AccessConfig,
-    /// How much of it one caller may do at the same time.
+    /// Limits of what one caller may do at the same time.
     pub quotas: QuotaConfig,
-    /// Where spans go, for OpenTelemetry.
+    /// Destination of OpenTelemetry spans.
     pub otlp: OtlpConfig,
 }
 
@@ -80,8 +80,8 @@ impl Check for ServiceConfig {
 }
 
 impl ServiceConfig {
-    /// What a daemon shows to others and whom it trusts as their client: what the environment says (`from_environment`), else its own
-    /// certificate and the authority of its clients, one authority being for a whole system.
+    /// The certificate that a daemon shows as a client, and the authority that it trusts. These come from the environment
+    /// (`from_environment`), else they are its own certificate and the authority of its clients, because a system has one authority.
     ///
     /// # Errors
     /// [`TlsError`] of a file that cannot be read.
@@ -94,8 +94,8 @@ impl ServiceConfig {
         }
     }
 
-    /// What processes that a daemon starts have in their environment, so that they let in whom the daemon does and show what it shows:
-    /// `file` is the system's config. What the environment of this process says of TLS stays.
+    /// Environment variables of the processes that a daemon starts, so that they admit the same clients and show the same certificate.
+    /// `file` is the system's config. TLS variables in the environment of this process stay as they are.
     pub fn for_workers(&self, file: Option<&Path>) -> BTreeMap<&'static str, PathBuf> {
         let mut environment = BTreeMap::new();
         if let Some(file) = file.and_then(|file| std::path::absolute(file).ok()) {
@@ -109,12 +109,12 @@ impl ServiceConfig {
         environment
     }
 
-    /// How a daemon serves that counts here.
+    /// How a daemon serves that counts its calls in `metrics`.
     pub fn serving(&self, metrics: &Arc<Metrics>) -> Serving {
         self.serving_with(&LiveAccess::new(self.access.clone()), metrics)
     }
 
-    /// As [`ServiceConfig::serving`], with roles that may change meanwhile.
+    /// As [`ServiceConfig::serving`], with roles that may change while it runs.
     pub fn serving_with(&self, access: &LiveAccess, metrics: &Arc<Metrics>) -> Serving {
         Serving {
             exposure: Exposure {
@@ -151,7 +151,7 @@ impl Gate for QuotaGate {
         if let Some(permit) = self.quotas.admit(caller, path, Instant::now())? {
             extensions.insert(permit);
         }
-        // For the calls on a stream.
+        // For calls that come on a stream.
         extensions.insert(self.quotas.clone());
         Ok(())
     }

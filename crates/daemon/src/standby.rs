@@ -1,4 +1,4 @@
-//! Taking the place of the one process that serves a role, and standing by while another one has it.
+//! Takes the place of the one process that serves a role, and stands by while another process has it.
 //!
 //! ```text
 //!   log in files: open the state ──▶ bind ──▶ serve
@@ -6,7 +6,7 @@
 //!                   │          ▲ the leader is gone
 //!                   └─ held ───┴── standing by: health NOT_SERVING, every call refused, with the address of the leader
 //! ```
-//! A standby counts as ready for a service manager. Clients that know several addresses go to the one that is SERVING.
+//! A service manager considers a standby ready. Clients that know several addresses use the one that is SERVING.
 
 use crate::access::{Caller, RoleGate};
 use crate::config::{Engine, StorageConfig};
@@ -34,13 +34,13 @@ use tonic::codegen::http;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Identity as Shown};
 use tonic::{Code, Status};
 
-/// When whoever was refused by a standby should ask again.
+/// Retry delay of a client that a standby refused.
 const RETRY_DELAY: Duration = Duration::from_millis(200);
-/// Where etcd does not answer, it is asked again after so long.
+/// Pause before etcd is asked again where it did not answer.
 const AGAIN: Duration = Duration::from_millis(500);
-/// A connection attempt to a member of etcd that takes longer has failed.
+/// Timeout of a connection attempt to an etcd member.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(500);
-/// A member of etcd that does not answer a ping for so long is connected to anew.
+/// Interval of keepalive pings to an etcd member and their timeout; without an answer the connection is opened anew.
 const KEEPALIVE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(2));
 
 /// A role that is to be served.
@@ -53,7 +53,7 @@ pub(crate) struct Place<'a> {
 }
 
 impl Place<'_> {
-    /// The state, and where to serve it; nothing where `shutdown` came while another process had it.
+    /// The state, and the bound address; `None` where `shutdown` came while another process had the place.
     pub(crate) async fn take<T: Send + 'static>(
         self,
         open: impl Fn(Arc<dyn Store>) -> Result<T, JournalError> + Clone + Send + 'static,
@@ -80,7 +80,7 @@ impl Place<'_> {
         shutdown: &CancellationToken,
     ) -> anyhow::Result<Option<T>> {
         let elected = CancellationToken::new();
-        // However this ends, nobody is refused any more.
+        // Whatever the result, calls are no longer refused afterwards.
         let _elected = elected.clone().drop_guard();
         let mut standby: Option<(Arc<NotTheLeader>, JoinHandle<()>)> = None;
         let news = |standby: &Option<(Arc<NotTheLeader>, _)>, why: &String| {
@@ -97,20 +97,20 @@ impl Place<'_> {
             };
             let opened = tokio::select! {
                 opened = attempt => opened.context("the state could not be opened")?,
-                // The place, should it just have been got, is given up when the attempt has ended.
+                // A place that was just taken is given up when the attempt has ended.
                 () = shutdown.cancelled() => return Ok(None),
             };
             let why = match opened {
                 Ok(kept) => {
                     elected.cancel();
-                    // Nobody who connects from now on is told by it that this process stands by.
+                    // From now on no new connection is told that this process stands by.
                     if let Some((_, refusing)) = standby {
                         let _ = refusing.await;
                     }
                     return Ok(Some(kept));
                 }
                 Err(JournalError::Open { source: OpenError::Held { holder, .. }, .. }) => format!("{holder} leads"),
-                // etcd comes and goes; who stands by waits for it.
+                // etcd may be unreachable for a while; a standby waits for it.
                 Err(JournalError::Open { source: OpenError::Read(error @ ReadError::Remote { .. }), .. }) => {
                     let why = format!("nobody is known to lead: {error}");
                     if news(&standby, &why) {
@@ -119,7 +119,7 @@ impl Place<'_> {
                     tokio::time::sleep(AGAIN).await;
                     why
                 }
-                // Another host may accept it, for all.
+                // Another host may accept the restored state, for all.
                 Err(JournalError::Open { source: error @ OpenError::Restored { .. }, .. }) => {
                     let why = error.to_string();
                     if news(&standby, &why) {
@@ -142,7 +142,7 @@ impl Place<'_> {
         }
     }
 
-    /// Refuses everybody until `elected`, and then closes every connection.
+    /// Refuses every call until `elected`, and then closes every connection.
     fn stand_by(
         &self,
         bound: &Bound,
@@ -164,8 +164,8 @@ impl Place<'_> {
     }
 }
 
-/// Serves until `shutdown`. `over` is cancelled as soon as no call is under way any more: a successor need not wait until every connection
-/// is closed.
+/// Serves until `shutdown`. `over` is cancelled as soon as no call is in progress any more: a successor need not wait until every
+/// connection is closed.
 pub(crate) async fn serve(
     bound: Bound,
     services: Services,
@@ -179,7 +179,7 @@ pub(crate) async fn serve(
             std::future::pending::<()>().await;
         }
     };
-    // On the heap: it is large.
+    // Boxed, because the future is large.
     let mut served = Box::pin(bound.serve_as(services, serving, shutdown));
     tokio::select! {
         biased;
@@ -189,7 +189,7 @@ pub(crate) async fn serve(
     served.await
 }
 
-/// Lets nobody in, and says who leads.
+/// Refuses every caller, and says who leads.
 struct NotTheLeader {
     role: &'static str,
     why: Mutex<String>,

@@ -1,5 +1,5 @@
-//! The calls that come over one stream ([`ratn_worker::multiplex`]): each is let in and counted as if it had come alone, for the caller of
-//! the stream.
+//! The calls that come over one stream ([`ratn_worker::multiplex`]): each is admitted and counted like a separate call of the stream's
+//! caller.
 
 use crate::access::Caller;
 use crate::details::retry_later;
@@ -9,17 +9,17 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tonic::{Code, Status};
 
-/// When to ask again after a refusal for the number of calls.
+/// Retry delay after a refusal because of too many calls.
 const RETRY_DELAY: Duration = Duration::from_millis(10);
 
-/// The reason of a refusal for the number of calls.
+/// Reason code of a refusal because of too many calls.
 const TOO_MANY: &str = "TOO_MANY";
 
-/// Who calls over a stream, and where its calls are counted.
+/// The caller of a stream, and where its calls are counted.
 #[derive(Debug, Clone)]
 pub(crate) struct StreamCaller {
     pub(crate) caller: Caller,
-    /// What its calls count for; none where the server has no quotas.
+    /// The quotas for which its calls count; `None` where the server has no quotas.
     pub(crate) quotas: Option<Quotas>,
     pub(crate) metrics: Arc<Metrics>,
 }
@@ -31,7 +31,7 @@ impl StreamCaller {
         StreamCaller { caller: Caller::of(request), quotas, metrics }
     }
 
-    /// Performs a call to `path` unless its caller may not make it, or makes too many.
+    /// Performs a call to `path`, unless its caller is not allowed to make it or makes too many.
     pub(crate) async fn call<T>(
         self,
         path: &'static str,
@@ -50,7 +50,7 @@ impl StreamCaller {
         answered
     }
 
-    /// What is answered to a call where `most` are under way on the stream.
+    /// The answer to a call where `most` are in progress on the stream.
     pub(crate) fn too_many(&self, most: usize) -> Status {
         self.metrics.refused("call", TOO_MANY.to_owned());
         let message = format!("{most} calls are under way on this stream: wait for answers");

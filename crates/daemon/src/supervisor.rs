@@ -1,10 +1,11 @@
-//! The interface to the machine's service manager (systemd): `sd_notify(3)` and SIGHUP. Without one nothing is sent, and
-//! SIGHUP means the same.
+//! The interface to the machine's service manager (systemd): `sd_notify(3)` and SIGHUP. Without a service manager nothing is sent, and
+//! SIGHUP still reloads.
 //!
 //! ```text
 //!   starting ─▶ READY ─ SIGHUP ─▶ RELOADING ─▶ READY ─ drain ─▶ STOPPING          WATCHDOG, twice per time that systemd waits
 //! ```
-//! The watchdog's pings tell of the turns of the daemon's core: one that hangs, or has ended, is silent, and systemd ends the process.
+//! The watchdog pings depend on the turns of the daemon's core: a core that hangs or has ended sends none, and systemd ends the
+//! process.
 
 use ratn_worker::server::Phase;
 use ratn_worker::vitals::Vitals;
@@ -17,10 +18,10 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::watch;
 use tokio::time::MissedTickBehavior;
 
-/// What a child must not inherit: it would speak for its parent.
+/// Variables that a child must not inherit: otherwise it would report to systemd in place of its parent.
 const VARIABLES: [&str; 3] = ["NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"];
 
-/// A program that does not speak for this process.
+/// A command for a program that does not report to systemd for this process.
 pub fn command_of(program: &Path) -> Command {
     let mut command = Command::new(program);
     for variable in VARIABLES {
@@ -46,7 +47,7 @@ impl Supervisor {
         Ok(Supervisor { hangups: signal(SignalKind::hangup())?, watchdog })
     }
 
-    /// Says how far the process is, and calls `reload` at every SIGHUP while it serves. Returns when it has ended.
+    /// Reports the phases of the process, and calls `reload` at every SIGHUP while it serves. Returns when the process has ended.
     pub async fn follow(mut self, mut phase: watch::Receiver<Phase>, vitals: Vitals, mut reload: impl FnMut()) {
         let mut condition = vitals.condition();
         let mut beats = None;
@@ -72,7 +73,7 @@ impl Supervisor {
                         Phase::Starting => {}
                         Phase::StandingBy => say(&[NotifyState::Ready, NotifyState::Status("standing by")]),
                         Phase::Serving => say(&[NotifyState::Ready, NotifyState::Status("serving")]),
-                        // One soon after the other is all that is seen.
+                        // If both come close together, only the second is seen here.
                         Phase::Draining | Phase::Drained => say(&[NotifyState::Stopping, NotifyState::Status("draining")]),
                     }
                 }
@@ -98,19 +99,19 @@ impl Supervisor {
     }
 }
 
-/// Whether the core took a turn since the last look. Without one whose turns are known, the runtime's being here is enough.
+/// Whether the core took a turn since the last check. Without a core that counts its turns, it is enough that the runtime works.
 fn has_moved(last: &mut Option<u64>, beats: Option<u64>) -> bool {
     let moved = beats.is_none() || beats != *last;
     *last = beats;
     moved
 }
 
-/// A process without a server of its own is ready.
+/// Reports a process without a server of its own as ready.
 pub fn ready() {
     say(&[NotifyState::Ready]);
 }
 
-/// And it ends.
+/// Reports that this process is stopping.
 pub fn stopping() {
     say(&[NotifyState::Stopping]);
 }

@@ -1,7 +1,7 @@
-//! Logs of a process: to standard error or the journal, as text or as JSON, filtered by `RATN_LOG` (as `info,ratn_daemon=debug`) or
-//! else by the config; and the audit log, in a file of its own.
+//! Logs of a process: to standard error or the journal, as text or as JSON, filtered by `RATN_LOG` (such as
+//! `info,ratn_daemon=debug`) or else by the config; and the audit log, in a separate file.
 //!
-//! [`Logs::reload`] changes the filter and opens the audit file again (it may have been moved away), nothing else.
+//! [`Logs::reload`] changes the filter and reopens the audit file (it may have been rotated), nothing else.
 
 use crate::audit;
 use serde::{Deserialize, Serialize};
@@ -22,60 +22,60 @@ pub const FILTER_VARIABLE: &str = "RATN_LOG";
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LogConfig {
-    /// As `info,ratn_daemon=debug`; `RATN_LOG` overrides it.
+    /// Such as `info,ratn_daemon=debug`; `RATN_LOG` overrides it.
     pub filter: String,
-    /// How a line looks on standard error.
+    /// Format of a line on standard error.
     pub format: LogFormat,
-    /// Where to.
+    /// Destination of the log.
     pub to: LogPlace,
 }
 
-/// How a line looks.
+/// Format of a line.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LogFormat {
     /// For people.
     #[default]
     Text,
-    /// One object a line.
+    /// One JSON object per line.
     Json,
 }
 
-/// Where logs go.
+/// Destination of logs.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LogPlace {
-    /// The journal where standard error is the journal's (a unit of systemd), else standard error.
+    /// The journal where standard error is connected to it (in a systemd unit), else standard error.
     #[default]
     Auto,
     /// Standard error.
     Stderr,
-    /// systemd's journal, every field for itself.
+    /// systemd's journal, with separate fields.
     Journald,
 }
 
-/// Logs that cannot be written as wanted.
+/// Why logs cannot be written as configured.
 #[derive(Debug, thiserror::Error)]
 pub enum LogError {
-    /// The filter is none.
+    /// The filter is not valid.
     #[error("`{filter}` is no log filter; as `info,ratn_daemon=debug`")]
     Filter {
-        /// As written.
+        /// The filter as written.
         filter: String,
-        /// Why.
+        /// The reason.
         #[source]
         source: filter::ParseError,
     },
     /// The audit file cannot be opened.
     #[error("cannot append to the audit log {}", file.display())]
     Audit {
-        /// Which.
+        /// The file.
         file: PathBuf,
-        /// Why.
+        /// The reason.
         #[source]
         source: io::Error,
     },
-    /// There is no journal.
+    /// There is no journal on this machine.
     #[error("cannot write to the journal; `log.to = \"stderr\"` needs none")]
     Journal(#[source] io::Error),
 }
@@ -105,14 +105,14 @@ pub fn start() {
     debug_assert!(started.is_ok() || std::env::var_os(FILTER_VARIABLE).is_some(), "{started:?}");
 }
 
-/// Starts logging for a process; where it was started before, that one stays.
+/// Starts logging for a process. If logging was started before, that logger stays.
 ///
 /// # Errors
 /// [`LogError`].
 pub fn start_as(config: &LogConfig, audit_file: Option<&Path>) -> Result<Logs, LogError> {
     type Boxed = Box<dyn Layer<Registry> + Send + Sync>;
     let (filter, handle) = reload::Layer::new(filter_of(config)?);
-    // It would say on the same standard error, and panic, that nothing can be written there.
+    // An internal error would be printed to the same standard error that cannot be written, and panic.
     let text = tracing_subscriber::fmt::layer().with_writer(io::stderr).with_ansi(false).log_internal_errors(false);
     let to = match config.to {
         LogPlace::Auto if stderr_is_the_journals() => LogPlace::Journald,
@@ -132,18 +132,18 @@ pub fn start_as(config: &LogConfig, audit_file: Option<&Path>) -> Result<Logs, L
         json.with_writer(file).with_filter(only).boxed()
     });
     let layers: Vec<Boxed> = [Some(main), audit_layer].into_iter().flatten().collect();
-    // Fails only where logging was started before: then that one stays.
+    // Fails only where logging was started before: then that logger stays.
     let _ = tracing_subscriber::registry().with(layers).try_init();
     Ok(Logs { filter: handle, audit })
 }
 
 impl Logs {
-    /// Takes over the filter, and opens the audit file again.
+    /// Sets the filter, and opens the audit file again.
     ///
     /// # Errors
-    /// [`LogError`]; what could not be changed stays as it was.
+    /// [`LogError`]; a setting that could not be changed stays as it was.
     pub fn reload(&self, config: &LogConfig) -> Result<(), LogError> {
-        // Fails only where logging was started before: then these logs are nobody's.
+        // Fails only where another logger was started before: then this filter is not in use.
         let _ = self.filter.reload(filter_of(config)?);
         match &self.audit {
             Some(audit) => audit.open_again(),
@@ -152,14 +152,15 @@ impl Logs {
     }
 }
 
-/// systemd says in `JOURNAL_STREAM` which file (device and inode) is the journal's: it may be inherited by who writes elsewhere.
+/// `JOURNAL_STREAM` names the file (device and inode) of the journal. The variable may be inherited by a process that writes
+/// elsewhere, so the file is compared.
 fn stderr_is_the_journals() -> bool {
     let said = std::env::var("JOURNAL_STREAM").unwrap_or_default();
     let there = nix::sys::stat::fstat(io::stderr()).map(|file| format!("{}:{}", file.st_dev, file.st_ino));
     there.is_ok_and(|there| there == said)
 }
 
-/// Mutations are not in the log unless it is asked for them by name.
+/// The audit log's records stay out of the log unless the filter names their target.
 fn filter_of(config: &LogConfig) -> Result<EnvFilter, LogError> {
     let text = std::env::var(FILTER_VARIABLE).ok().filter(|text| !text.is_empty());
     let mut text = text.unwrap_or_else(|| config.filter.clone());
@@ -169,7 +170,7 @@ fn filter_of(config: &LogConfig) -> Result<EnvFilter, LogError> {
     EnvFilter::try_new(&text).map_err(|source| LogError::Filter { filter: text, source })
 }
 
-/// Whether a filter is one.
+/// Whether the text is a valid filter.
 pub(crate) fn is_filter(text: &str) -> bool {
     EnvFilter::try_new(text).is_ok()
 }
@@ -191,7 +192,7 @@ fn append(path: &Path) -> Result<File, LogError> {
     opened.map_err(|source| LogError::Audit { file: path.to_owned(), source })
 }
 
-/// A line goes out in one write, before the call is answered.
+/// A line is written in one write, before the call is answered.
 struct AuditLine<'a>(MutexGuard<'a, File>);
 
 impl io::Write for AuditLine<'_> {

@@ -1,4 +1,5 @@
-//! HTTP for one page, by hyper. Bounded: few connections, little to read, little time; each is closed after its answer.
+//! HTTP for one page, by hyper. Bounded: few connections, small requests, short timeouts; each connection is closed
+//! after its answer.
 
 use super::Metrics;
 use hyper::body::Incoming;
@@ -15,15 +16,15 @@ use std::time::Duration;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 
-/// Connections at the same time; more are closed at once.
+/// Maximum number of connections at the same time; further ones are closed at once.
 const MAX_CONNECTIONS: usize = 16;
-/// The head of a request has at most this many bytes (hyper takes no fewer) …
+/// The head of a request has at most this many bytes (hyper accepts no smaller limit) …
 const MAX_REQUEST_BYTES: usize = 8 * 1024;
 /// … and this many headers …
 const MAX_HEADERS: usize = 64;
 /// … and is read and answered in this time.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// After a connection that could not be had: the process is out of descriptors.
+/// Pause after `accept` failed: the process is out of file descriptors.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
 const PATH: &str = "/metrics";
 const PLAIN: &str = "text/plain; charset=utf-8";
@@ -32,27 +33,27 @@ const OPENMETRICS: &str = "application/openmetrics-text; version=1.0.0; charset=
 /// An address at which metrics cannot be shown.
 #[derive(Debug, thiserror::Error)]
 pub enum ListenError {
-    /// Other machines could read them, and nothing would say who they are.
+    /// Other machines could read the metrics, and callers are not authenticated.
     #[error("metrics at {address} could be read from other machines: say a loopback address, or --insecure")]
     Exposed {
-        /// Which.
+        /// The address.
         address: SocketAddr,
     },
-    /// The system does not give it.
+    /// The system refuses the address.
     #[error("cannot show metrics at {address}")]
     Refused {
-        /// Which.
+        /// The address.
         address: SocketAddr,
-        /// Why.
+        /// The reason.
         #[source]
         source: io::Error,
     },
 }
 
-/// Shows metrics at `http://address/metrics` for as long as the runtime lives; where that is.
+/// Serves metrics at `http://address/metrics` for as long as the runtime lives. Returns the address that is in use.
 ///
 /// # Errors
-/// [`ListenError`]; beyond loopback unless `insecure`.
+/// [`ListenError`]; also for an address beyond loopback, unless `insecure`.
 pub async fn listen(metrics: Arc<Metrics>, address: SocketAddr, insecure: bool) -> Result<SocketAddr, ListenError> {
     if !address.ip().is_loopback() && !insecure {
         return Err(ListenError::Exposed { address });
@@ -74,14 +75,14 @@ async fn serve(metrics: Arc<Metrics>, listener: TcpListener) {
         let Ok(place) = Arc::clone(&places).try_acquire_owned() else { continue };
         let metrics = metrics.clone();
         tokio::spawn(async move {
-            // Who left, or was too slow, hears nothing.
+            // A client that left or was too slow gets no answer.
             let _ = tokio::time::timeout(PATIENCE, answer(&metrics, connection)).await;
             drop(place);
         });
     }
 }
 
-/// One request of a connection, and its answer.
+/// Answers the one request of a connection.
 async fn answer(metrics: &Metrics, connection: TcpStream) -> hyper::Result<()> {
     let page = service_fn(async |request: Request<Incoming>| Ok::<_, Infallible>(page(metrics, &request)));
     http1::Builder::new()
@@ -121,7 +122,7 @@ mod tests {
         connection.write_all(request).await.unwrap();
         connection.shutdown().await.unwrap();
         let mut answer = String::new();
-        // What is refused before it was read to its end may be reset.
+        // The server may reset a connection whose request it refused before the end.
         let _ = connection.read_to_string(&mut answer).await;
         answer
     }

@@ -1,4 +1,4 @@
-//! Metrics of a daemon for Prometheus: in the text form of OpenMetrics, at `/metrics` of a listener of its own.
+//! Metrics of a daemon for Prometheus: in the OpenMetrics text format, at `/metrics` of a separate listener.
 //!
 //! Made once for each daemon and given to every part that counts something. Serving them is separate ([`listen`]). Labels take few values: methods of this system, gRPC codes, reasons of refusals; never what a client sent.
 
@@ -20,13 +20,13 @@ use std::fmt;
 use std::time::Duration;
 use tonic::Code;
 
-/// Seconds of a call: from what a local call takes to what somebody complains about.
+/// Buckets of the duration of a call in seconds: from a local call to one that is too slow for a user.
 const CALL_SECONDS: [f64; 15] =
     [5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0, 5.0];
-/// Seconds in the queue: from none to what a task waits for another.
+/// Buckets of the time in the queue in seconds: from no wait to the duration of another task.
 const WAIT_SECONDS: [f64; 11] = [1e-4, 1e-3, 1e-2, 0.1, 0.5, 1.0, 5.0, 10.0, 60.0, 300.0, 1800.0];
 
-/// All of them. Daemons other than the resource manager have only the calls, and the world pool its journal.
+/// All metrics. Daemons other than the resource manager have only those of calls, and the world pool also those of its journal.
 #[derive(Debug)]
 pub struct Metrics {
     registry: Registry,
@@ -42,7 +42,7 @@ pub struct Metrics {
     pub(crate) journal: JournalMetrics,
 }
 
-/// Of what is kept over a restart. Clones count together.
+/// Metrics of durable state. Clones share their counters.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct JournalMetrics {
     pub(crate) entries: Counter,
@@ -51,7 +51,7 @@ pub(crate) struct JournalMetrics {
     pub(crate) failed: Gauge,
 }
 
-/// How much there is of what.
+/// Current amounts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct Amounts {
     pub(crate) resources: usize,
@@ -74,7 +74,7 @@ struct Refusal {
     reason: String,
 }
 
-/// What became of the spans of this process.
+/// Counts of the spans that this process sent and dropped.
 #[derive(Debug)]
 struct Spans(ratn_otlp::Counts);
 
@@ -105,7 +105,7 @@ impl JournalMetrics {
 }
 
 impl Metrics {
-    /// Of a daemon of this role, which has counted nothing yet.
+    /// The metrics of a daemon of this role, all zero.
     pub fn new(role: &str) -> Metrics {
         let metrics = Metrics {
             registry: Registry::with_prefix("ratn"),
@@ -123,7 +123,7 @@ impl Metrics {
         metrics.registered(role)
     }
 
-    /// With what became of the spans of this process, where it sends any.
+    /// Adds the counts of spans, where this process sends any.
     #[must_use]
     pub fn with_spans(mut self) -> Metrics {
         if let Some(sender) = ratn_otlp::sender() {
@@ -158,7 +158,7 @@ impl Metrics {
         self
     }
 
-    /// A call by its path was answered. Those of services that are not of this system are not counted.
+    /// Counts a call that was answered. Calls of services that are not part of this system are not counted.
     pub(crate) fn call(&self, path: &str, code: Code, took: Duration) {
         if let Some(method) = method_of(path) {
             let (service, method) = (method.service, method.name);
@@ -171,7 +171,7 @@ impl Metrics {
         self.queue_wait.observe(waited.as_secs_f64());
     }
 
-    /// Something was refused for one of this system's reasons.
+    /// Counts a refusal for one of this system's reasons.
     pub(crate) fn refused(&self, operation: &'static str, reason: String) {
         self.refusals.get_or_create(&Refusal { operation, reason }).inc();
     }
@@ -184,10 +184,10 @@ impl Metrics {
         }
     }
 
-    /// All of them as text.
+    /// All metrics as text.
     fn text(&self) -> String {
         let mut text = String::new();
-        // Writing to a string fails for nobody.
+        // Writing to a string cannot fail.
         let _ = encode(&mut text, &self.registry);
         text
     }
