@@ -1,38 +1,38 @@
-//! What a calibration is off, added to what a detection is; and what a surface of known height says about both.
+//! Adds the camera's calibration error to a detection's covariance, and corrects both by a surface of known height.
 //!
-//! A detection is relative to the camera's pose as given. Where that is wrong by a small displacement t and a small turn r along and about the
-//! axes of the optical frame, an object at p in that frame is wrong by t + r × p: with 0.1° at 1.3 m that is 2 mm, more than the noise. To first
-//! order the two covariances add. Many a surface is known better than that: a table's top has a height and is level. Then the
-//! surface on which an object was seen measures the calibration: a Kalman filter's update (Kalman 1960) of the object's pose by the height
-//! and the two slopes, one after the other, corrects what goes with them.
+//! A detection is relative to the camera's pose as given. If that pose is wrong by a small displacement t and a small rotation r along and about
+//! the axes of the optical frame, an object at p in that frame is wrong by t + r × p: with 0.1° at 1.3 m that is 2 mm, more than the noise. To
+//! first order the two covariances add. Many surfaces are known better than that: a table top has a known height and is level. Then the surface
+//! on which an object was seen measures the calibration: an update of a Kalman filter (Kalman 1960) with the height and the two slopes, one
+//! after the other, corrects all components that correlate with them.
 
 use crate::camera::Camera;
 use crate::detection::Detection;
 use crate::vector::{cross, sub};
 use ratn_model::pose::Pose;
 
-/// Of a pose: x, y, z in metres, then small turns about these axes in radians.
+/// Covariance of a pose: x, y, z in metres, then small rotations about these axes in radians.
 type Covariance = [[f64; 6]; 6];
 
-/// The variances of a camera's pose: place along and a small turn about the axes of its optical frame, in metres² and radians².
+/// Variances of a camera's pose: displacements along and small rotations about the axes of its optical frame, in metres² and radians².
 pub type Calibration = [f64; 6];
 
-/// A level surface whose height is known.
+/// A level surface of known height.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Surface {
     /// Its height, in metres.
     pub height_m: f64,
-    /// The deviation of that, in metres.
+    /// The standard deviation of the height, in metres.
     pub sigma_m: f64,
-    /// The deviation of its slope about any axis, in radians.
+    /// The standard deviation of its slope about any axis, in radians.
     pub sigma_rad: f64,
 }
 
-/// By how many deviations an object may be above or below a surface and still stand on it.
+/// Maximum distance of an object from a surface on which it can stand, in standard deviations.
 const GATE: f64 = 5.0;
 
 impl Detection {
-    /// The same with what the calibration of the camera may be off.
+    /// Adds the error of the camera's calibration to the covariance.
     #[must_use]
     pub fn with_calibration(mut self, camera: &Camera, calibration: &Calibration) -> Detection {
         let shared = self.by_calibration(camera, calibration);
@@ -40,13 +40,13 @@ impl Detection {
         self
     }
 
-    /// The covariance that the calibration alone gives it.
+    /// The covariance that follows from the calibration alone.
     fn by_calibration(&self, camera: &Camera, calibration: &Calibration) -> Covariance {
         let from_camera = sub(self.pose.position, camera.pose.position);
         let mut covariance = [[0.0; 6]; 6];
         for (i, variance) in calibration.iter().enumerate() {
             let axis = camera.pose.rotate(std::array::from_fn(|k| f64::from(u8::from(k == i % 3))));
-            // How an error along or about this axis moves and turns what is seen.
+            // How an error along or about this axis displaces and rotates what is seen.
             let (moves, turns) = if i < 3 { (axis, [0.0; 3]) } else { (cross(axis, from_camera), axis) };
             let along = |k: usize| if k < 3 { moves[k] } else { turns[k - 3] };
             covariance = each(|row, column| covariance[row][column] + variance * along(row) * along(column));
@@ -54,10 +54,11 @@ impl Detection {
         covariance
     }
 
-    /// The same, whose covariance has the calibration in it, known to stand on a surface, unless it is too far above or below it for that.
+    /// Corrects a detection, whose covariance includes the calibration, by a surface on which it is known to stand, unless it is too far above
+    /// or below the surface.
     ///
-    /// What goes with height and slope is corrected by what the calibration says of that, not by the fit's own correlations: where a fit
-    /// leaves a direction open, its covariance says metres, and a tenth of a millimetre of height would move the object by centimetres.
+    /// The gains follow from the calibration's correlations, not from those of the fit: where a fit leaves a direction undetermined, its
+    /// covariance has metres there, and a tenth of a millimetre of height would move the object by centimetres.
     #[must_use]
     pub fn standing_on(mut self, surface: &Surface, camera: &Camera, calibration: &Calibration) -> Detection {
         let up = self.pose.rotate([0.0, 0.0, 1.0]);
@@ -70,7 +71,7 @@ impl Detection {
         let shared = self.by_calibration(camera, calibration);
         let own = |k: usize| self.covariance[k][k] - shared[k][k];
         let mut gains_of = each(|row, column| shared[row][column] + if row == column { own(row) } else { 0.0 });
-        // What is missing after one of them is known depends on that.
+        // After each measurement, the remaining error depends on the change so far.
         let mut change = [0.0; 6];
         let slope = surface.sigma_rad.powi(2);
         for (of, missing, variance) in [(2, missing, variance), (3, up[1], slope), (4, -up[0], slope)] {
@@ -88,7 +89,7 @@ impl Detection {
     }
 }
 
-/// The covariance after a measurement of one component with a variance, for any gain (Joseph's form).
+/// The covariance after a measurement of one component with a variance, for any gain (Joseph form).
 fn updated(before: &Covariance, of: usize, gain: &[f64; 6], variance: f64) -> Covariance {
     each(|row, column| {
         before[row][column] - gain[row] * before[of][column] - before[row][of] * gain[column]
@@ -110,7 +111,7 @@ mod tests {
 
     const SIGMA_M: f64 = 0.002;
     const SIGMA_RAD: f64 = 0.003;
-    /// Of a detection by itself.
+    /// Standard deviation of a detection's own error.
     const OWN_M: f64 = 0.0005;
     const SIZE: [f64; 3] = [0.12, 0.07, 0.10];
     const TABLE: Surface = Surface { height_m: 0.7, sigma_m: 0.001, sigma_rad: 0.0005 };
@@ -123,11 +124,11 @@ mod tests {
         std::array::from_fn(|i| if i < 3 { SIGMA_M } else { SIGMA_RAD }.powi(2))
     }
 
-    /// Boxes on a table as a camera sees them whose calibration is off, and where they are.
+    /// Boxes on a table as seen by a camera with a calibration error, and their true poses.
     fn seen() -> Vec<(Detection, Pose)> {
         let (camera, calibration) = (camera(), calibration());
         let mut random = ChaCha8Rng::seed_from_u64(7);
-        // The sum of twelve uniforms.
+        // The sum of twelve uniforms is about normal.
         let mut normal = move |sigma: f64| sigma * ((0..12).map(|_| random.random::<f64>()).sum::<f64>() - 6.0);
         let once = |i: usize| {
             let on = TABLE.height_m + normal(TABLE.sigma_m);
@@ -145,7 +146,7 @@ mod tests {
         (0..500).map(once).collect()
     }
 
-    /// The squared error of the position by its covariance, over its three dimensions, in the mean.
+    /// The mean squared position error weighted by the inverse covariance, divided by its three dimensions.
     fn normalised_square(of: &[(Detection, Pose)]) -> f64 {
         let one = |(seen, truth): &(Detection, Pose)| {
             let e = sub(seen.pose.position, truth.position);
@@ -195,7 +196,7 @@ mod tests {
     #[test]
     fn what_a_fit_leaves_open_is_not_moved_by_a_little_height() {
         let (mut seen, _) = seen().swap_remove(0);
-        // A box whose ends were not seen: two metres along y, and a little of that goes up.
+        // A box whose ends were not seen: its variance along y is metres, with a small correlation to z.
         seen.covariance = [[0.0; 6]; 6];
         (seen.covariance[0][0], seen.covariance[1][1], seen.covariance[2][2]) = (1e-6, 4.0, 1e-6);
         (seen.covariance[1][2], seen.covariance[2][1]) = (1.9e-3, 1.9e-3);

@@ -1,18 +1,18 @@
 //! The camera model: a pinhole without distortion, and the depth images it makes.
 //!
 //! The optical frame has z forward, x right and y down, as in image processing. A depth is the z coordinate of the point
-//! seen, in metres; 0 means that nothing came back.
+//! seen, in metres; 0 means no return.
 
 use ratn_model::pose::Pose;
 use serde::{Deserialize, Serialize};
 
-/// What a pinhole camera is made of; all in pixels.
+/// The parameters of a pinhole camera, in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Intrinsics {
-    /// Columns.
+    /// Number of columns.
     pub width: usize,
-    /// Rows.
+    /// Number of rows.
     pub height: usize,
     /// Focal length along x.
     pub fx: f64,
@@ -24,47 +24,47 @@ pub struct Intrinsics {
     pub cy: f64,
 }
 
-/// A camera in its place.
+/// A camera with its pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     /// Its optics.
     pub intrinsics: Intrinsics,
-    /// Its optical frame in the world.
+    /// The pose of its optical frame in the world.
     pub pose: Pose,
 }
 
 /// A depth image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DepthImage {
-    /// Columns.
+    /// Number of columns.
     pub width: usize,
-    /// Rows.
+    /// Number of rows.
     pub height: usize,
-    /// Metres along the optical axis, row by row from the upper left; 0 is no return.
+    /// Depths along the optical axis in metres, row by row from the upper left; 0 is no return.
     pub depth: Vec<f32>,
 }
 
-/// Bytes that are not the depth image they are said to be.
+/// Why bytes are not a depth image.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ImageError {
     /// The wrong number of bytes.
     #[error("a depth image of {width} × {height} has {expected} bytes (f32, row by row), not {found}")]
     Length {
-        /// Columns.
+        /// Number of columns.
         width: usize,
-        /// Rows.
+        /// Number of rows.
         height: usize,
-        /// What there should be.
+        /// The expected number of bytes.
         expected: usize,
-        /// What there is.
+        /// The actual number of bytes.
         found: usize,
     },
-    /// More pixels than anybody's camera has.
+    /// The image is larger than any supported camera's.
     #[error("an image of {width} × {height} is larger than {MAX_SIDE} × {MAX_SIDE}")]
     TooLarge {
-        /// Columns.
+        /// Number of columns.
         width: usize,
-        /// Rows.
+        /// Number of rows.
         height: usize,
     },
 }
@@ -76,7 +76,7 @@ impl Intrinsics {
     /// 320 × 240 pixels and 52° × 40°: modest, so that a frame costs milliseconds, and wide enough for the table.
     pub const DEFAULT: Intrinsics = Intrinsics { width: 320, height: 240, fx: 330.0, fy: 330.0, cx: 159.5, cy: 119.5 };
 
-    /// The direction of a pixel's ray in the optical frame, with z = 1: times the depth it is the point.
+    /// The direction of a pixel's ray in the optical frame, with z = 1: multiplied by the depth, it is the point.
     pub fn ray(&self, column: usize, row: usize) -> [f64; 3] {
         [(column as f64 - self.cx) / self.fx, (row as f64 - self.cy) / self.fy, 1.0]
     }
@@ -121,7 +121,7 @@ impl DepthImage {
         Ok(DepthImage { width, height, depth })
     }
 
-    /// The depth of a pixel, `None` where nothing came back.
+    /// The depth of a pixel; `None` for no return.
     pub fn at(&self, column: usize, row: usize) -> Option<f64> {
         let depth = *self.depth.get(row * self.width + column)?;
         (depth.is_finite() && depth > 0.0).then_some(f64::from(depth))

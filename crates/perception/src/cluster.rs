@@ -1,20 +1,20 @@
 //! Euclidean clusters (Rusu 2009, section 6.2): points belong together when a chain of close points joins them.
 //!
-//! Points are first gathered in cells, so that what is near the camera does not cost more than what is far; the cells' middles
-//! go into a k-d tree, and clusters grow along its answers.
+//! Points are first gathered in cells, so that near surfaces with many points do not cost more than far ones. The centroids of
+//! the cells go into a k-d tree, and clusters grow along its neighbours.
 
 use crate::vector::Vector;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
 /// The edge of a cell, in metres.
 const CELL: f64 = 0.007;
-/// How far apart the cells of a chain may be, in metres.
+/// Maximum distance between neighbouring cells of a cluster, in metres.
 const LINK: f64 = 0.016;
 /// A cell with fewer neighbours than this is a stray point.
 const MIN_NEIGHBOURS: usize = 3;
-/// More clusters than this are not looked at.
+/// Maximum number of clusters.
 const MAX_CLUSTERS: usize = 256;
-/// More points than this are not gathered: an image full of clutter.
+/// Maximum number of points that are gathered: more are clutter.
 const MAX_POINTS: usize = 1 << 20;
 
 /// Clusters of at least `min_size` points, each a list of indices of `points`, the largest first.
@@ -37,7 +37,7 @@ pub(crate) fn clusters(points: &[Vector], min_size: usize) -> Vec<Vec<u32>> {
         let (mut members, mut open) = (Vec::new(), vec![start]);
         while let Some(cell) = open.pop() {
             let neighbours = near(cell);
-            // The cell itself is among them. A stray joins nothing.
+            // The cell itself is among its neighbours. A stray cell joins nothing.
             if neighbours.len() <= MIN_NEIGHBOURS {
                 continue;
             }
@@ -59,7 +59,7 @@ pub(crate) fn clusters(points: &[Vector], min_size: usize) -> Vec<Vec<u32>> {
     found
 }
 
-/// The cell of a point, 21 bits an axis.
+/// The cell of a point, 21 bits per axis.
 fn key(point: &Vector) -> u64 {
     point.iter().fold(0, |key, c| (key << 21) | (((c / CELL).floor() as i64 + (1 << 20)) as u64 & 0x1F_FFFF))
 }

@@ -1,8 +1,8 @@
-//! Depth image → objects on a supporting surface.
+//! From a depth image to the objects on a supporting surface.
 //!
-//! Points of the region → the plane by RANSAC → points above it, the robot's own body left out → clusters on a k-d tree → to
-//! each cluster every model that it could be, from its principal axes → the one that explains it best, refined. What no
-//! model explains (a part of an arm, a thing of no known class) is left out.
+//! The steps: points of the region → the plane by RANSAC → points above it, without the robot's own body → clusters with a k-d tree →
+//! for each cluster every model that is possible by its principal axes → the model that explains the cluster best, refined. A cluster
+//! that no model explains (part of an arm, an object of no known class) is left out.
 
 use crate::camera::{Camera, DepthImage};
 use crate::fit::start::Outline;
@@ -14,16 +14,16 @@ use crate::view::View;
 use ratn_model::pose::Pose;
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// Where to look: a flat surface on which things stand.
+/// Where to look: a flat surface on which objects stand.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Region {
-    /// The middle of the surface, its z axis up.
+    /// The centre of the surface, its z axis up.
     pub pose: Pose,
     /// Its extents along x and y, in metres.
     pub size: [f64; 2],
 }
 
-/// What was seen before.
+/// An object as detected before.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Prior {
     /// Its centre.
@@ -32,23 +32,23 @@ pub struct Prior {
     pub size: [f64; 3],
 }
 
-/// An object as seen.
+/// A detected object.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Detection {
     /// Its shape, in metres. A box's first edge is not shorter than its second.
     pub model: Model,
-    /// The middle of its bounding box, upright on the surface. A box's yaw is within a quarter turn of the region's x axis
-    /// (half a turn more looks the same), a fork's x axis points to the tips, what is round has the region's yaw.
+    /// The centre of its bounding box, upright on the surface. A box's yaw is within a quarter turn of the region's x axis (half a
+    /// turn more looks the same), a fork's x axis points to the tips, round objects have the region's yaw.
     pub pose: Pose,
-    /// Of the position in metres² and of a small turn in radians², both along the world's axes: rows and columns x, y, z, and
-    /// turns about x, y, z. Of what any turn leaves the same, the yaw's variance is that of an unknown angle.
+    /// Covariance of the position in metres² and of a small rotation in radians², both along the world's axes: rows and columns are x,
+    /// y, z, and rotations about x, y, z. For round objects the yaw's variance is that of an unknown angle.
     pub covariance: [[f64; 6]; 6],
-    /// How sure it is that this is an object of this class, 0 to 1: how much of what was measured the model explains, times
-    /// how much better it does than the other classes.
+    /// Confidence that this is an object of this class, 0 to 1: the part of the points that the model explains, reduced by how well
+    /// other classes explain them.
     pub confidence: f64,
 }
 
-/// Why nothing can be said.
+/// Why there is no result.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum DetectionError {
     /// The surface is not in the image.
@@ -56,10 +56,10 @@ pub enum DetectionError {
         "no supporting plane in the region: {points} points of it are in the image; look at it, with the arm out of view"
     )]
     NoPlane {
-        /// How many points of the region were seen.
+        /// Number of points of the region in the image.
         points: usize,
     },
-    /// The image and the camera do not fit together.
+    /// The size of the image differs from the camera's.
     #[error("an image of {width} × {height} cannot come from this camera")]
     WrongCamera {
         /// Columns of the image.
@@ -69,38 +69,38 @@ pub enum DetectionError {
     },
 }
 
-/// How much of its cluster a model must explain.
+/// Minimum part of its cluster that a model must explain.
 const MIN_EXPLAINED: f64 = 0.7;
-/// How badly it may explain what was measured, see `Fit::score`.
+/// Maximum score of a model, see `Fit::score`.
 const MAX_SCORE: f64 = 0.6;
-/// How far apart the middles of two parts of one thing are at the most, in metres.
+/// Maximum distance between the centroids of two parts of one object, in metres.
 const MAX_APART: f64 = 0.12;
-/// How far around a known object is looked for it, in metres.
+/// Margin of the search around a known object, in metres.
 const SEARCH_MARGIN: f64 = 0.15;
-/// How far a known object may have moved, in metres.
+/// Maximum displacement of a known object, in metres.
 const MAX_DISPLACEMENT: f64 = 0.08;
-/// How far from a region's pose its surface is, and how far from below a known object, in metres, as normal distributions' deviations.
+/// Standard deviation of the surface's height about a region's pose, and about the underside of a known object, in metres.
 const REGION_DEVIATION: f64 = 0.02;
 const PRIOR_DEVIATION: f64 = 0.01;
-/// How much the sizes of a known object may differ from what is seen, in metres, and how much of them.
+/// Allowed difference of a known object's dimensions from the measured ones: in metres, and as a part of them; the larger counts.
 const SIZE_SLACK: (f64, f64) = (0.025, 0.25);
-/// A difference of scores by which one class is e times as likely as another.
+/// The difference of scores by which one class is e times as likely as another.
 const SCORE_SCALE: f64 = 0.06;
-/// Classes whose scores differ by less are compared with more points.
+/// Classes whose scores differ by less are compared again with more points.
 const CLOSE: f64 = 0.15;
-/// Scores that differ by less say nothing.
+/// Scores that differ by less are considered equal.
 const ALIKE: f64 = 0.05;
-/// What does not average out over an object's points: noise also decides which of them are told from the surface, and from which
-/// side an edge is seen. As a part of one point's deviation along its ray, as measured on random tables.
+/// Noise that does not average out over an object's points, because noise also decides which points are separated from the surface and
+/// from which side an edge is seen. As a part of one point's standard deviation along its ray; measured on random tables.
 const COMMON_NOISE: f64 = 0.12;
-/// Points, rays beside them, edges, and iterations, to tell what something could be and to say where it is.
+/// Numbers of points, free rays and edges, and iterations: to classify a cluster, and to locate the object.
 const COARSE: ([usize; 3], usize) = ([140, 50, 30], 8);
 const FINE: ([usize; 3], usize) = ([500, 120, 100], 9);
 
-/// Starts that are followed to tell which way round a fork lies, iterations for that, and to say where it does.
+/// For a fork: number of starts that are refined to find its direction, iterations for that, and iterations for the final pose.
 const RELIEF: (usize, usize, usize) = (4, 4, 12);
 
-/// Every object of these classes on the surface, those nearest to the camera first. `body` is where the robot is itself.
+/// All objects of these classes on the surface, nearest to the camera first. `body` is the robot's own body.
 ///
 /// # Errors
 /// [`DetectionError`] when the surface is not in the image.
@@ -113,7 +113,7 @@ pub fn segment(
 ) -> Result<Vec<Detection>, DetectionError> {
     let mut found = objects_on(image, camera, region, classes, body, REGION_DEVIATION)?;
     let eye = camera.pose.position;
-    // To the centimetre, then by y: what noise tells apart is not told apart.
+    // Rounded to centimetres, then sorted by y, so that noise does not change the order.
     let key = |object: &Detection| {
         let [x, y, _] = object.pose.position;
         (((x - eye[0]).hypot(y - eye[1]) * 100.0).round() as i64, (y * 1000.0).round() as i64)
@@ -122,7 +122,7 @@ pub fn segment(
     Ok(found)
 }
 
-/// What was last seen as `prior`: looks around there for the object of these classes and about that size nearest to it.
+/// Locates the object that was last seen as `prior`: the nearest object there of these classes and of about that size.
 ///
 /// # Errors
 /// [`DetectionError`] when the surface below it is not in the image.
@@ -141,14 +141,14 @@ pub fn locate(
         found.retain(|object| object.pose.distance(&prior.pose) <= MAX_DISPLACEMENT && alike(prior, object));
         Ok(found.into_iter().min_by(|a, b| a.pose.distance(&prior.pose).total_cmp(&b.pose.distance(&prior.pose))))
     };
-    // On the surface it stood on; else on the one that is seen most of, where it may have got to.
+    // On the surface on which it stood; else on the surface that most points lie on, where it may have fallen.
     match nearest_on(PRIOR_DEVIATION)? {
         Some(found) => Ok(Some(found)),
         None => nearest_on(f64::INFINITY),
     }
 }
 
-/// Whether an object could be the one seen before, by its size.
+/// Whether an object could be the one seen before, by its dimensions.
 fn alike(prior: &Prior, object: &Detection) -> bool {
     let sorted = |[x, y, z]: [f64; 3]| [x.max(y), x.min(y), z];
     let (before, now) = (sorted(prior.size), sorted(object.model.size()));
@@ -165,7 +165,7 @@ fn objects_on(
 ) -> Result<Vec<Detection>, DetectionError> {
     let mut view = View::new(image, camera, region, body, deviation)?;
     let mut found: Vec<Explained> = Vec::new();
-    // Large clusters first: a steep side can come apart from its top, and must not make a second object in the same place.
+    // Large clusters first: a steep side can be separated from its top, and must not become a second object in the same place.
     let mut fragments = Vec::new();
     for cluster in 0..view.clusters.len() {
         match explanation(&view, cluster, classes) {
@@ -173,7 +173,7 @@ fn objects_on(
             _ => fragments.push(cluster),
         }
     }
-    // What is hollow comes apart where its far side is seen over its near one. One side may look like a smaller thing.
+    // A hollow object falls into parts where its far side is seen over its near one. One part may look like a smaller object.
     let mut parts = Vec::new();
     for fragment in fragments {
         let whole = found.iter().enumerate().find_map(|(i, part)| {
@@ -199,35 +199,35 @@ fn objects_on(
     Ok(found.into_iter().map(|explained| explained.object).collect())
 }
 
-/// What a cluster is.
+/// The explanation of a cluster.
 struct Explained {
     cluster: usize,
     fit: Fit,
-    /// How badly its fit explains it.
+    /// The score of its fit.
     score: f64,
     object: Detection,
 }
 
 impl Explained {
-    /// Whether something stands there already.
+    /// Whether an object already stands there.
     fn is_taken(&self, found: &[Explained]) -> bool {
         found.iter().any(|other| other.fit.covers(self.fit.at()) || self.fit.covers(other.fit.at()))
     }
 }
 
-/// What a cluster is, if a model explains it.
+/// The explanation of a cluster, if a model explains it.
 fn explanation(view: &View<'_>, cluster: usize, classes: &[ObjectClass]) -> Option<Explained> {
     let tried = likeliest(view, cluster, classes);
     let best = tried.first()?.1;
     let evidence = view.evidence(cluster, FINE.0);
-    // Those that come close are told apart by more points.
+    // Models with close scores are compared with more points.
     let close = tried.iter().filter(|(_, score)| score - best < CLOSE);
     let mut close: Vec<(Fit, f64)> =
         close.map(|(fit, _)| fit.clone().refined(&evidence, FINE.1).scored(&evidence)).collect();
     close.sort_by(|a, b| a.1.total_cmp(&b.1));
     let (fit, score) = close.swap_remove(0);
     let explained = fit.explains(&evidence);
-    // Of a fork the depths of all pixels around it say whether there is one.
+    // A fork is confirmed by the depths of all pixels around it instead.
     if fit.class != ObjectClass::Fork && (explained < MIN_EXPLAINED || score > MAX_SCORE) {
         return None;
     }
@@ -242,7 +242,7 @@ fn explanation(view: &View<'_>, cluster: usize, classes: &[ObjectClass]) -> Opti
         let common = common(&fit, &evidence);
         (fit, covariance, common)
     };
-    // What the image hardly says stays in, with a covariance that says so; a fit that came out as no number at all is none.
+    // A poorly determined object is kept, with a covariance that says so; a fit with undefined numbers is dropped.
     let is_fitted = (0..2).all(|i| covariance.pose[i][i].is_finite()) && covariance.height.is_finite();
     if !is_fitted {
         return None;
@@ -251,7 +251,8 @@ fn explanation(view: &View<'_>, cluster: usize, classes: &[ObjectClass]) -> Opti
     Some(Explained { cluster, fit, score, object })
 }
 
-/// Where a fork lies, by the depths around it; whichever way round explains them better. `None` where the surface alone does as well.
+/// The pose of a fork by the depths around it, in the better of both directions. `None` where the surface alone explains the depths as
+/// well.
 fn lying(view: &View<'_>, fit: &Fit) -> Option<(Fit, Covariance)> {
     let relief = view.relief(fit);
     let starts = relief.starts(fit).into_iter().take(RELIEF.0);
@@ -262,14 +263,14 @@ fn lying(view: &View<'_>, fit: &Fit) -> Option<(Fit, Covariance)> {
     relief.shows(cost).then_some((fit, covariance))
 }
 
-/// What noise has in common over an object's points: a shift along the ray.
+/// The displacement by common noise of an object's points: a shift along the ray.
 fn common(fit: &Fit, evidence: &Evidence) -> Vector {
     let [x, y] = fit.at();
     let away = sub([x, y, 0.0], evidence.eye);
     scale(away, COMMON_NOISE * evidence.sigma / length(away))
 }
 
-/// Of each class that a cluster could be the best fit to some of its points and how badly it explains them, the likeliest first.
+/// For each possible class of a cluster, the best fit to a sample of its points with its score, best first.
 fn likeliest(view: &View<'_>, cluster: usize, classes: &[ObjectClass]) -> Vec<(Fit, f64)> {
     let evidence = view.evidence(cluster, COARSE.0);
     let Some(outline) = Outline::of(&evidence.points) else { return Vec::new() };
@@ -309,10 +310,10 @@ fn detection(view: &View<'_>, fit: &Fit, planar: &Covariance, common: Vector, co
     }
 }
 
-/// The covariances of the fit and of the plane, and what the fit does not know, together; turned into the world.
+/// The covariances of the fit and of the plane, plus the errors that the fit does not know; rotated into the world.
 fn covariance(view: &View<'_>, fit: &Fit, planar: &Covariance, common: Vector) -> [[f64; 6]; 6] {
     let mut local = [[0.0; 6]; 6];
-    // x, y and yaw are the fit's, height and slopes the plane's; half of the height's error is the centre's.
+    // x, y and yaw come from the fit, height and slopes from the plane; half of the height's error is the centre's.
     for (i, row) in [0, 1, 5].into_iter().enumerate() {
         for (j, column) in [0, 1, 5].into_iter().enumerate() {
             local[row][column] = planar.pose[i][j];
@@ -334,7 +335,7 @@ fn covariance(view: &View<'_>, fit: &Fit, planar: &Covariance, common: Vector) -
         }
     }
     if fit.class.symmetry() == Symmetry::Round {
-        // Of an angle of which nothing is known.
+        // The variance of an unknown angle.
         local[5][5] = PI * PI / 3.0;
     }
     let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| view.frame.rotate(axis));

@@ -1,11 +1,12 @@
-//! Where depth jumps: edges, at which pixels see a mixture of near and far, and the shadows of the projector beside what is near.
+//! Depth discontinuities: edges, at which pixels see a mixture of near and far, and the shadows of the projector beside near
+//! objects.
 
 use crate::camera::{DepthImage, Intrinsics};
 
-/// A step of the depth between neighbours that makes an edge, or casts a shadow, in metres.
+/// Minimum depth step between neighbouring pixels at an edge or for a shadow, in metres.
 const STEP: f32 = 0.02;
 
-/// Of each pixel whether a neighbour is nearer or farther by a step.
+/// For each pixel, whether a neighbour is nearer or farther by at least a step.
 pub(crate) fn edges(image: &DepthImage) -> Vec<bool> {
     let (width, height) = (image.width, image.height);
     let mut edges = vec![false; image.depth.len()];
@@ -25,7 +26,7 @@ pub(crate) fn edges(image: &DepthImage) -> Vec<bool> {
     edges
 }
 
-/// The nearest and the farthest depth of a pixel and those around it; what is empty does not count. `None` where all is.
+/// The least and the greatest depth among a pixel and its neighbours, without empty ones; `None` where all are empty.
 pub(crate) fn around(image: &DepthImage, pixel: usize) -> Option<[f32; 2]> {
     let (column, row) = (pixel % image.width, pixel / image.width);
     let mut bounds = None;
@@ -41,13 +42,14 @@ pub(crate) fn around(image: &DepthImage, pixel: usize) -> Option<[f32; 2]> {
     bounds
 }
 
-/// The pixels that the projector does not light: along a row of it, which is a row of the image, something nearer is in the way.
+/// The pixels that the projector does not light because something nearer is in the way, along a row of the projector, which is a
+/// row of the image.
 pub(crate) fn shadows(image: &DepthImage, optics: &Intrinsics, projector_m: f64) -> Vec<bool> {
     let mut shadows = vec![false; image.depth.len()];
     if projector_m <= 0.0 {
         return shadows;
     }
-    // The projector's column of a pixel is to the left of the camera's by the disparity.
+    // In the projector's image a pixel's column is farther left by the disparity.
     let column = |here: usize, depth: f32| here as f64 - optics.fx * projector_m / f64::from(depth);
     let bins = 2 * image.width;
     let bin = |column: f64| (column + image.width as f64).round().clamp(0.0, bins as f64 - 1.0) as usize;

@@ -1,10 +1,10 @@
-//! A model fitted to what was measured of one cluster: iterated closest points on the model's surface, with free space.
+//! Fits a model to the measurements of one cluster: iterated closest points on the model's surface, with free space.
 //!
-//! Every measured point pulls the model's surface towards itself (point to surface; Chen and Medioni 1992, with the closest
-//! point given by the signed distance instead of a search). Points alone would let a model grow behind its visible faces, so
-//! every ray that reached the table beside the cluster pushes out what it would have to pass through. Both are least squares
-//! over place, yaw and the model's own dimensions, by Levenberg and Marquardt, with weights that fade beyond a cut-off which
-//! shrinks as the fit settles. Objects stand upright: the frame's z = 0 is the surface.
+//! Every measured point pulls the model's surface towards itself (point to surface; Chen and Medioni 1992, with the closest point given by
+//! the signed distance instead of a search). With points alone a model could grow behind its visible faces, so every ray that reached the
+//! table beside the cluster pushes away the parts of the model that it would pass through. Both are least squares over position, yaw and
+//! the model's dimensions, by Levenberg and Marquardt, with weights that fade to zero at a cut-off, which shrinks as the fit settles.
+//! Objects stand upright: the frame's z = 0 is the surface.
 
 mod placed;
 pub(crate) mod relief;
@@ -16,66 +16,66 @@ use crate::normal::{Blocks, N as MAX_PARAMETERS, Normal};
 use crate::vector::Vector;
 use placed::{Deepest, NEAR, Placed};
 
-/// What was measured of a cluster and around it, in the frame of the supporting surface.
+/// The measurements of a cluster and around it, in the frame of the supporting surface.
 #[derive(Debug, Clone)]
 pub(crate) struct Evidence {
-    /// Where the camera is.
+    /// Position of the camera.
     pub(crate) eye: Vector,
     /// Points of the cluster.
     pub(crate) points: Vec<Vector>,
-    /// Where rays beside the cluster ended, at or below the surface.
+    /// End points of the rays beside the cluster, at or below the surface.
     pub(crate) free: Vec<Vector>,
     /// Rays along the cluster's silhouette.
     pub(crate) edges: Vec<Edge>,
-    /// Below this height points are not counted on: only those that noise has lifted were told from the surface.
+    /// Points below this height are not used: only those that noise has lifted were separated from the surface.
     pub(crate) floor: f64,
     /// Standard deviation of a point, in metres.
     pub(crate) sigma: f64,
-    /// Standard deviation of what the noise of neighbouring points has in common, in metres.
+    /// Standard deviation of the noise that neighbouring points share, in metres.
     pub(crate) shared: f64,
     /// The distance between neighbouring pixels at the cluster, in metres.
     pub(crate) pitch: f64,
 }
 
-/// A ray beside a place that is half-way between a pixel that sees the cluster and one that sees far past it. Within a corner a ray is less
-/// deep than it is far from the silhouette; beside it, distances are true.
+/// A ray a little outside of the silhouette, which lies half-way between a pixel that sees the cluster and one that sees far past it.
+/// Inside a corner, a ray's depth in the model is less than its distance from the silhouette; outside, the two distances are equal.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Edge {
-    /// Where the ray reaches the surface.
+    /// The point at which the ray reaches the surface.
     pub(crate) end: Vector,
-    /// How far outside of the silhouette it passes, in metres.
+    /// Distance of the ray from the silhouette, in metres.
     pub(crate) beside: f64,
-    /// Standard deviation of where the silhouette is, across the ray, in metres.
+    /// Standard deviation of the silhouette's position across the ray, in metres.
     pub(crate) sigma: f64,
 }
 
-/// A model in its place: z = 0 is below it.
+/// A model with its pose: z = 0 is its underside.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Fit {
     pub(crate) class: ObjectClass,
-    /// x, y, yaw, the model's dimensions, its form.
+    /// x, y, yaw, the model's dimensions and its form.
     parameters: Parameters,
 }
 
 impl Evidence {
-    /// Standard deviation of a point about a model, in metres: things are not quite their models.
+    /// Standard deviation of a point from a model, in metres: objects differ a little from their models.
     fn spread(&self) -> f64 {
         self.sigma.hypot(UNLIKE)
     }
 
-    /// A point farther away is none of a model's, in metres.
+    /// A point farther away than this does not belong to the model, in metres.
     fn cut_off(&self) -> f64 {
         (3.0 * self.spread()).max(EXPLAINED)
     }
 }
 
-/// How uncertain a fit is: variances and covariances of x, y, yaw; the variance of its height.
+/// Uncertainty of a fit: variances and covariances of x, y, yaw; the variance of its height.
 pub(crate) struct Covariance {
     pub(crate) pose: [[f64; 3]; 3],
     pub(crate) height: f64,
 }
 
-/// x, y, yaw, at most three dimensions, and a form.
+/// x, y, yaw, at most three dimensions, and the form.
 type Parameters = [f64; MAX_PARAMETERS];
 const YAW: usize = 2;
 const FIRST_DIMENSION: usize = 3;
@@ -85,24 +85,24 @@ const FIRST_FORM: usize = 6;
 const DIFFERENCE: f64 = 1e-4;
 /// The cut-off of the first iteration, in metres.
 const FIRST_CUT_OFF: f64 = 0.015;
-/// How much of it the next has.
+/// Factor of the cut-off from one iteration to the next.
 const CUT_OFF_FADE: f64 = 0.7;
-/// A point this near, or within three deviations, is explained, in metres.
+/// A point nearer than this, or within three standard deviations, is explained, in metres.
 const EXPLAINED: f64 = 0.004;
-/// How far things are from models, as a standard deviation in metres: of a point, and of a silhouette.
+/// Standard deviations of objects from their models, in metres: of a point, and of a silhouette.
 const UNLIKE: f64 = 0.0015;
 pub(crate) const UNLIKE_AT_EDGES: f64 = 0.001;
-/// The same of points that are next to each other, all of them alike.
+/// The same for neighbouring points, which deviate together.
 const UNLIKE_AROUND: f64 = 0.0003;
-/// An edge of the silhouette that is more deviations off than this is none of the model's: a handle's.
+/// A silhouette edge that deviates by more standard deviations than this does not belong to the model: it is a handle's, for example.
 const EDGE_CUT_OFF: f64 = 3.5;
-/// Points that are less than this apart share noise, and what the model is not, in metres.
+/// Size of a block in metres: points in one block share noise and the deviation from the model.
 const BLOCK: f64 = 0.02;
-/// The variance of what the evidence does not determine, in metres² and radians².
+/// Variance of parameters that the evidence does not determine, in metres² and radians².
 const UNKNOWN: f64 = 0.01;
-/// A step below which a fit has settled, in metres and radians.
+/// A fit has settled when a step is below this, in metres and radians.
 const SETTLED: f64 = 1e-4;
-/// The longest step of one iteration, in metres; of yaw in radians, ten times as much.
+/// Maximum step of one iteration, in metres; ten times as much for yaw, in radians.
 const LONGEST_STEP: f64 = 0.02;
 
 impl Fit {
@@ -124,7 +124,7 @@ impl Fit {
         self.parameters[YAW]
     }
 
-    /// The same turned about its axis, in radians.
+    /// Turns it about its upright axis, in radians.
     pub(crate) fn turned(&self, by: f64) -> Fit {
         let mut turned = self.clone();
         turned.parameters[YAW] += by;
@@ -181,7 +181,7 @@ impl Fit {
         (self, score)
     }
 
-    /// How many of the points lie on its surface, 0 to 1.
+    /// The part of the points that lie on its surface, 0 to 1.
     pub(crate) fn explains(&self, evidence: &Evidence) -> f64 {
         let placed = Placed::of(self, evidence.eye);
         let near = evidence.cut_off();
@@ -189,7 +189,7 @@ impl Fit {
         explained as f64 / evidence.points.len().max(1) as f64
     }
 
-    /// Whether a place on the surface is below it.
+    /// Whether it stands above a place on the surface.
     pub(crate) fn covers(&self, place: [f64; 2]) -> bool {
         let (sin, cos) = self.yaw().sin_cos();
         let (x, y) = (place[0] - self.parameters[0], place[1] - self.parameters[1]);
@@ -197,7 +197,7 @@ impl Fit {
         (cos * x + sin * y).abs() < length / 2.0 && (cos * y - sin * x).abs() < width / 2.0
     }
 
-    /// How well the evidence determines it, by its noise and the size of pixels.
+    /// How well the evidence determines it, given the noise and the pixel size.
     pub(crate) fn covariance(&self, evidence: &Evidence) -> Covariance {
         let cut_off = evidence.cut_off();
         let (mut normal, mut blocks) = (Normal::default(), Blocks::default());
@@ -212,7 +212,7 @@ impl Fit {
                 blocks.add(block(*point), &slope, residual, evidence.sigma.powi(-2));
             }
         }
-        // A ray that passes within a pixel says where the edge is, to about a pixel.
+        // A ray that passes within a pixel determines the edge to about a pixel.
         for ray in evidence.free.iter().filter_map(|end| placed.deepest(evidence, *end, NEAR)) {
             if ray.depth.abs() < evidence.pitch / 2.0 {
                 let slope = self.slope(&moved, ray.depth, |p| p.fill_distance(ray.place));
@@ -236,13 +236,13 @@ impl Fit {
         let shared = evidence.shared.powi(2) + UNLIKE_AROUND.powi(2);
         let covariance = normal.with_shared(&blocks, shared).inverse(&fixed).unwrap_or(unknown);
         let pose = std::array::from_fn(|row| std::array::from_fn(|column| covariance[row][column]));
-        // A fork's height follows its length.
+        // A fork's height follows from its length.
         let last = FIRST_DIMENSION + self.class.ranges().len() - 1;
         let height = if self.class == ObjectClass::Fork { 0.0 } else { covariance[last][last] };
         Covariance { pose, height }
     }
 
-    /// The parameters that do not exist or change nothing.
+    /// The parameters that do not exist or have no effect.
     fn fixed(&self) -> [bool; MAX_PARAMETERS] {
         let dimensions = self.class.ranges().len();
         std::array::from_fn(|i| match i {
@@ -253,7 +253,7 @@ impl Fit {
         })
     }
 
-    /// This fit with each parameter a little greater.
+    /// This fit with each parameter increased a little.
     fn neighbours(&self, eye: Vector) -> [Option<Placed>; MAX_PARAMETERS] {
         let fixed = self.fixed();
         std::array::from_fn(|i| {
@@ -312,7 +312,7 @@ impl Fit {
         normal
     }
 
-    /// How unusual its form is, as a cost.
+    /// The cost of an unusual form.
     fn unusual(&self, evidence: &Evidence) -> f64 {
         let usual = self.class.usual().iter().zip(&self.parameters[FIRST_FORM..]);
         let off = usual.filter(|(usual, _)| usual.is_free()).map(|(usual, form)| (form - usual.mean) / usual.deviation);
@@ -340,18 +340,18 @@ impl Fit {
     }
 }
 
-/// How far the evidence is from a fit.
+/// The differences between the evidence and a fit.
 struct Residuals {
     /// Of each point, in metres.
     points: Vec<f64>,
-    /// Of each edge, where its ray passes near it.
+    /// Of each edge, where its ray passes close by.
     edges: Vec<Option<Deepest>>,
-    /// Of the rays that pass near it.
+    /// Of the free rays that pass close by.
     rays: Vec<Deepest>,
 }
 
 impl Residuals {
-    /// The points that the model has above the floor: chosen by where the model is, not by where noise has put them.
+    /// The points that the model has above the floor: selected by the model's surface, not by the noisy points.
     fn used(&self, evidence: &Evidence) -> Vec<bool> {
         self.points.iter().zip(&evidence.points).map(|(residual, p)| p[2] - residual > evidence.floor).collect()
     }
@@ -373,10 +373,10 @@ impl Residuals {
     }
 }
 
-/// What a ray through the model keeps at least of its weight, however deep: it is no stray.
+/// Minimum weight of a ray through the model, however deep it passes: it is no outlier.
 const RAY_WEIGHT: f64 = 0.2;
 
-/// Half the square up to the cut-off, fading to a bound (Tukey's biweight, scaled to half the cut-off's square).
+/// Half the square for small residuals, saturating at the cut-off (Tukey's biweight, scaled to half the cut-off's square).
 fn robust(residual: f64, cut_off: f64) -> f64 {
     let part = (residual / cut_off).powi(2).min(1.0);
     cut_off * cut_off / 2.0 * (1.0 - (1.0 - part).powi(3))

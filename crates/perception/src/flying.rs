@@ -1,17 +1,17 @@
-//! Flying pixels: at the edge of something a camera returns mixtures of near and far, which are on no surface.
+//! Flying pixels: at the edge of an object a camera returns mixtures of near and far, which lie on no surface.
 //!
-//! They are told by heights above the surface, not by depths, which change along every surface that is not seen straight on: a pixel
-//! flies where one side of it is clearly higher and the other clearly lower. An upright wall is so, too, from pixel to pixel, and gets
-//! that much slack.
+//! They are detected by heights above the surface, not by depths, because depth changes along every surface that is not seen straight
+//! on. A pixel flies where one side of it is clearly higher and the opposite side clearly lower. That also holds for an upright wall
+//! from pixel to pixel, so this much slack is allowed.
 
-/// How far beside a pixel its higher and its lower side are looked for, in pixels.
+/// How far from a pixel its higher and its lower side may be, in pixels.
 const REACH: isize = 2;
-/// By how many deviations of a difference of two heights a side is clearly higher or lower.
+/// Standard deviations of a height difference from which a side counts as higher or lower.
 const CLEARLY: f64 = 2.5;
-/// Rows and columns to one of each two opposite neighbours.
+/// Row and column steps to one of each pair of opposite neighbours.
 const AXES: [(isize, isize); 4] = [(0, 1), (1, 0), (1, 1), (1, -1)];
 
-/// Heights above the surface, in metres, row by row; not a number where nothing came back.
+/// Heights above the surface, in metres, row by row; NaN for no return.
 pub(crate) struct Heights<'a> {
     pub(crate) of: &'a [f32],
     pub(crate) width: usize,
@@ -20,12 +20,12 @@ pub(crate) struct Heights<'a> {
 }
 
 impl Heights<'_> {
-    /// Whether a pixel sees a mixture. `rise`: how much higher an upright wall is by a pixel there, in metres.
+    /// Whether a pixel sees a mixture. `rise` is the height of an upright wall per pixel there, in metres.
     pub(crate) fn is_flying(&self, pixel: usize, rise: f64) -> bool {
         let here = self.of[pixel];
         let noise = CLEARLY * std::f64::consts::SQRT_2 * self.sigma;
         AXES.iter().any(|axis| {
-            // The highest and the lowest on either side, beyond what a wall is.
+            // Whether either side is higher or lower by more than an upright wall would be.
             let [ahead, behind] = [1, -1].map(|sign| {
                 let (mut higher, mut lower) = (false, false);
                 for step in 1..=REACH {
@@ -54,7 +54,7 @@ mod tests {
 
     const WIDTH: usize = 24;
 
-    /// A block of 10 cm from column 8 on, seen straight from above, with what is between it and the table in column 7.
+    /// A block of 10 cm from column 8 on, seen from straight above, with height `between` in column 7.
     fn block(between: f32) -> Vec<f32> {
         let height = |column: usize| match column {
             ..7 => 0.0,
@@ -79,7 +79,7 @@ mod tests {
 
     #[test]
     fn a_wall_that_is_seen_from_above_does_not_fly() {
-        // 4 mm a row, upright.
+        // An upright wall with 4 mm per row.
         let wall: Vec<f32> = (0..WIDTH * WIDTH).map(|i| 0.004 * (i / WIDTH) as f32).collect();
         assert!(flying(&wall, 0.004).is_empty());
         assert!(!flying(&wall, 0.0).is_empty());

@@ -1,12 +1,12 @@
-//! Mean heights of pixels and those around them: noise falls by the window's side, so that what is flat is told from the
-//! surface it lies on. What is clearly above or below is left out of a mean, or it would spread over its edges.
+//! Mean heights over a window around each pixel: noise falls with the window's side, so that flat objects can be separated from the surface.
+//! Heights clearly above or below are left out of a mean, because they would spread over their edges.
 
 use crate::vector::median;
 
-/// Rows and columns of the window.
+/// Side of the window, in pixels.
 pub(crate) const SIDE: usize = 3;
 
-/// The mean around each pixel of heights that are within `limit` of the surface; not a number is no height. 0 where there is none.
+/// The mean around each pixel of the heights within `limit` of the surface; NaN is no height. 0 where there is none.
 pub(crate) fn means(heights: &[f32], width: usize, limit: f32) -> Vec<f32> {
     let near = |z: f32| if z.abs() < limit { (z, 1.0) } else { (0.0, 0.0) };
     // Sums along rows, then along columns.
@@ -34,13 +34,13 @@ pub(crate) fn means(heights: &[f32], width: usize, limit: f32) -> Vec<f32> {
     means
 }
 
-/// Rows and columns of a block of pixels whose noise is alike where a camera's noise is smooth.
+/// Side of a block of pixels that share noise, where a camera's noise is smooth.
 pub(crate) const BLOCK: usize = 8;
-/// Of fewer pairs of blocks nothing is told.
+/// Minimum number of pairs of blocks for an estimate.
 const LEAST_PAIRS: usize = 24;
 
-/// The standard deviation of what heights on the surface have in common in a block, beside their own of `sigma`: from the means of blocks that
-/// are on it as a whole, two blocks apart so that slopes and what is wrong about the surface hardly count. 0 where it cannot be told.
+/// The standard deviation of the noise that heights share in a block, apart from their own noise `sigma`. Estimated from the means of blocks
+/// that lie on the surface entirely, two blocks apart so that slopes and errors of the surface hardly count. 0 where there are too few.
 pub(crate) fn shared(heights: &[f32], width: usize, limit: f32, sigma: f64) -> f64 {
     let columns = width / BLOCK;
     let mean = |row: usize, column: usize| -> Option<f32> {
@@ -68,7 +68,7 @@ pub(crate) fn shared(heights: &[f32], width: usize, limit: f32, sigma: f64) -> f
     if apart.len() < LEAST_PAIRS {
         return 0.0;
     }
-    // 1.4826 times the median is a normal distribution's deviation.
+    // 1.4826 times the median is a normal distribution's standard deviation.
     let variance = (1.4826 * median(&mut apart).unwrap_or(0.0)).powi(2) / 2.0;
     (variance - sigma * sigma / (BLOCK * BLOCK) as f64).max(0.0).sqrt()
 }

@@ -1,9 +1,9 @@
-//! The robot's own body in its camera's image: what lies within it is nothing that was found.
+//! The robot's own body in its camera's image: points within it are not objects.
 
 use crate::vector::Vector;
 use ratn_model::pose::Pose;
 
-/// A part of the robot: a sphere in the world, in metres. Many of them hold a link.
+/// Part of the robot: a sphere in the world, in metres. Several spheres cover a link.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ball {
     /// Its centre.
@@ -12,15 +12,15 @@ pub struct Ball {
     pub radius: f64,
 }
 
-/// How far outside its spheres the body may be seen: noise, and the body where it was a moment ago; in metres.
+/// How far outside its spheres the body may be seen, because of noise and motion since the image; in metres.
 const MARGIN: f64 = 0.015;
 
-/// The balls that reach into a box around the surface, in its frame.
+/// The spheres that reach into a box around the surface, in the surface's frame.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Mask(Vec<(Vector, f64)>);
 
 impl Mask {
-    /// `frame` is the surface's, `reach` half of the box's edges along x and y, and its height.
+    /// `frame` is the surface's, `reach` is half of the box's edges along x and y, and its height.
     pub(crate) fn new(balls: &[Ball], frame: &Pose, reach: Vector) -> Mask {
         let to_frame = frame.inverse();
         let near = balls.iter().filter_map(|ball| {

@@ -1,9 +1,8 @@
-//! What stands on tables, as geometry: the classes of objects that detection knows, each a shape with a few free dimensions.
+//! Geometry of objects on tables: the classes that detection knows, each a shape with a few free dimensions.
 //!
-//! A model's frame is in the middle of its bounding box, z up as it stands. Two signed distances describe it to the fit: to
-//! its surface (`distance`: a measured point should be at 0), and to what light cannot cross from outside (`fill_distance`: a
-//! hollow thing filled up to its rim). `solid` is the same thing for the ray caster, so that what is rendered and what is fitted
-//! come from one description.
+//! A model's frame is in the centre of its bounding box, z up as it stands. Two signed distances describe it for the fit: to its surface
+//! (`distance`: 0 for a measured point), and to the volume that light cannot cross from outside (`fill_distance`: hollow objects are filled up to
+//! the rim). `solid` is the same object for the ray caster, so that rendering and fitting share one description.
 
 mod fork;
 pub(crate) mod form;
@@ -20,7 +19,7 @@ use std::ops::RangeInclusive;
 /// A class of objects, named as in the ontology.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub enum ObjectClass {
-    /// A cuboid of any edges.
+    /// A cuboid with any edges.
     Box,
     /// An upright cylinder, closed.
     Can,
@@ -30,7 +29,7 @@ pub enum ObjectClass {
     Bowl,
     /// Flat, with a raised rim.
     Plate,
-    /// Lies on its back: the tips point up, the neck is its highest part.
+    /// Lies on its back: the tips point up, the neck is the highest part.
     Fork,
 }
 
@@ -42,23 +41,23 @@ pub enum Model {
         /// Edge lengths.
         size: [f64; 3],
     },
-    /// Round about z.
+    /// Rotationally symmetric about z.
     Round {
         /// Can, cup, bowl or plate.
         kind: Round,
         /// The greatest radius.
         radius: f64,
-        /// From the table to the rim.
+        /// Height from the table to the rim.
         height: f64,
     },
     /// Along x, tines ahead.
     Fork {
-        /// From the end of the handle to the tips.
+        /// Length from the end of the handle to the tips.
         length: f64,
     },
 }
 
-/// What is round about its upright axis.
+/// Objects that are rotationally symmetric about their upright axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Round {
     /// See [`ObjectClass::Can`].
@@ -71,10 +70,10 @@ pub enum Round {
     Plate,
 }
 
-/// What a half or quarter turn about z leaves the same.
+/// Rotations about z that leave an object unchanged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Symmetry {
-    /// Nothing: every yaw differs.
+    /// None: every yaw differs.
     None,
     /// Half a turn.
     HalfTurn,
@@ -105,12 +104,12 @@ impl ObjectClass {
         }
     }
 
-    /// The class of that name.
+    /// The class with this name.
     pub fn named(name: &str) -> Option<ObjectClass> {
         ObjectClass::ALL.into_iter().find(|class| class.name() == name)
     }
 
-    /// What its individuals are named with: `box_`, `fork_`.
+    /// Prefix of the names of its individuals: `box_`, `fork_`.
     pub fn prefix(self) -> &'static str {
         match self {
             ObjectClass::Box => "box_",
@@ -122,7 +121,7 @@ impl ObjectClass {
         }
     }
 
-    /// What turns leave it the same.
+    /// Its rotational symmetry.
     pub fn symmetry(self) -> Symmetry {
         match self {
             ObjectClass::Box => Symmetry::HalfTurn,
@@ -131,7 +130,7 @@ impl ObjectClass {
         }
     }
 
-    /// Within what its dimensions are, in the order of [`Model::dimensions`], in metres.
+    /// The ranges of its dimensions, in the order of [`Model::dimensions`], in metres.
     pub fn ranges(self) -> &'static [RangeInclusive<f64>] {
         match self {
             ObjectClass::Box => &[0.02..=0.35, 0.02..=0.35, 0.03..=0.25],
@@ -143,7 +142,7 @@ impl ObjectClass {
         }
     }
 
-    /// The model of this class with these dimensions, held within its ranges.
+    /// The model of this class with these dimensions, clamped to their ranges.
     pub fn model(self, dimensions: &[f64]) -> Model {
         let within = |i: usize| {
             let range = &self.ranges()[i];
@@ -174,7 +173,7 @@ impl Model {
         }
     }
 
-    /// What may be chosen of it: edges, radius and height, or length, in metres.
+    /// Its free dimensions: edges, radius and height, or length, in metres.
     pub fn dimensions(&self) -> Vec<f64> {
         match *self {
             Model::Box { size } => size.to_vec(),
@@ -192,7 +191,7 @@ impl Model {
         }
     }
 
-    /// How much the topmost part of its wall leans outwards, in radians from upright; none for what has no rim.
+    /// How much the topmost part of its wall leans outwards, in radians from upright; `None` where there is no rim.
     pub fn rim_lean(&self) -> Option<f64> {
         match *self {
             Model::Round { kind, radius, height } => {
@@ -202,7 +201,7 @@ impl Model {
         }
     }
 
-    /// How far a point of its frame is from its surface as seen from `eye`, in metres; negative behind it.
+    /// Signed distance of a point in its frame from its surface as seen from `eye`, in metres; negative behind the surface.
     pub(crate) fn distance(&self, form: Form, point: Vector, eye: Vector) -> f64 {
         match *self {
             Model::Box { size } => seen_box_distance(point, size, eye),
@@ -217,7 +216,7 @@ impl Model {
         }
     }
 
-    /// How far a point of its frame is from what no ray from outside passes: itself, hollows filled.
+    /// Signed distance of a point in its frame from the volume that no ray from outside passes: the object with its hollows filled.
     pub(crate) fn fill_distance(&self, form: Form, point: Vector) -> f64 {
         match *self {
             Model::Round { kind, radius, height } => {
@@ -240,16 +239,16 @@ fn box_distance(point: Vector, size: [f64; 3]) -> f64 {
     outside + beyond[0].max(beyond[1]).max(beyond[2]).min(0.0)
 }
 
-/// The same for a point that noise has moved along its ray: where that ray meets the box, in front of it the distance is that from the face
-/// which it meets, and behind that from the nearest face that the eye sees. To take the nearest of all of it would pull on the faces beside an edge
-/// with what is in front of it, but not with what is behind.
+/// The same for a point that noise has moved along its ray: where that ray meets the box, the distance of a point in front is measured from the
+/// face that the ray meets, and of a point behind from the nearest face that the eye sees. The nearest distance to the whole box would pull the
+/// faces beside an edge only by the points in front, not by those behind.
 fn seen_box_distance(point: Vector, size: [f64; 3], eye: Vector) -> f64 {
     let (mut enters, mut leaves, mut front) = (0.0_f64, f64::INFINITY, 0.0);
     let mut behind = f64::NEG_INFINITY;
     for i in 0..3 {
         let (half, way) = (size[i] / 2.0, point[i] - eye[i]);
         let (near, far) = ((-half.copysign(way) - eye[i]) / way, (half.copysign(way) - eye[i]) / way);
-        // Along a face, numbers are infinite or none, and compare as they should.
+        // Along a face the numbers are infinite or NaN, and compare as intended.
         if near > enters {
             (enters, front) = (near, -(point[i] * way.signum() + half));
         }
@@ -286,7 +285,7 @@ mod tests {
             let body = Body { shape: model.solid(), pose: Pose::IDENTITY };
             let mut hits = 0;
             for i in 0..2000_u32 {
-                // From all around above, towards places near the middle.
+                // From all directions above, towards points near the centre.
                 let (turn, rise) = (f64::from(i) * 2.4, 0.35 + 0.9 * f64::from(i % 37) / 37.0);
                 let from = [turn.cos() * rise.cos(), turn.sin() * rise.cos(), rise.sin()];
                 let [x, y, _] = model.size();
@@ -296,7 +295,7 @@ mod tests {
                 let Some(time) = body.shape.cast_ray(&body.pose, &ray, 2.0, true) else { continue };
                 let hit = [0, 1, 2].map(|k| f64::from(origin[k] + way[k] * time));
                 hits += 1;
-                // Between the tines, light reaches their sides; the fit takes the head as closed.
+                // Between the tines light reaches their sides; the fit treats the head as closed.
                 let among_tines = class == ObjectClass::Fork && hit[0] > 0.35 * x;
                 let least = if among_tines { -fork::THICKNESS * x } else { 0.0 };
                 let distance = model.distance([0.0; FORMS], hit, from);
@@ -320,7 +319,7 @@ mod tests {
         for i in 0..4000_u32 {
             let (turn, rise) = (f64::from(i) * 2.4, 0.6 + 0.8 * f64::from(i % 37) / 37.0);
             let from = [turn.cos() * rise.cos(), turn.sin() * rise.cos(), rise.sin()].map(|c| 5.0 * c);
-            // Short of the tines, in whose gaps a ray may get lost.
+            // Up to the tines, in whose gaps a ray may get lost.
             let to = [0.9 * f64::from(i % 83) / 83.0 - 0.55, 0.16 * (f64::from(i % 71) / 71.0 - 0.5), -half];
             let way = [0, 1, 2].map(|k| to[k] - from[k]);
             let scaled = |v: Vector| Vector32::from_array(v.map(|c| (c * length) as f32));
@@ -329,7 +328,7 @@ mod tests {
             match (rendered, seen) {
                 (Some(rendered), Some((covered, at))) => {
                     met += 1;
-                    // Corners are mitred in one of them: there, by about the strip's thickness; elsewhere not at all.
+                    // One of the two has mitred corners: there they differ by about the strip's thickness, elsewhere not at all.
                     let off = (f64::from(rendered) - at).abs() * length_of(way);
                     assert!(covered > 0.99 && off < 2.0 * fork::THICKNESS, "{from:?} {to:?}: {rendered} {at}");
                     exact += u32::from(off < 0.1 * fork::THICKNESS);

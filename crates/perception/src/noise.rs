@@ -1,37 +1,37 @@
-//! What a structured-light camera does to the truth: noise that grows with the square of the distance, as of every sensor
-//! that triangulates (Khoshelham and Oude Elberink 2012, equation 10), pixels that do not return, more of them at edges, and the
-//! shadows beside what is near, where the projector's light does not reach.
+//! The errors of a structured-light camera: noise that grows with the square of the distance, as for every sensor that triangulates (Khoshelham and
+//! Oude Elberink 2012, equation 10); pixels without a return, more of them at edges; and shadows beside near objects, where the projector's light
+//! does not reach.
 //!
-//! Every sample is a hash of (seed, frame, pixel), so an image does not depend on the order in which it is made.
+//! Every sample is a hash of (seed, frame, pixel), so an image does not depend on the order in which it is computed.
 
 use crate::camera::{DepthImage, Intrinsics};
 use crate::edge;
 use serde::{Deserialize, Serialize};
 
-/// How noisy a camera is.
+/// The noise of a camera.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Noise {
     /// Standard deviation of a depth at one metre, in metres; grows with the square of the distance.
     pub sigma_at_1m: f64,
-    /// How many of the pixels return nothing, 0 to 1.
+    /// The part of the pixels that return nothing, 0 to 1.
     pub missing: f64,
-    /// How many of the pixels at an edge return nothing, 0 to 1.
+    /// The part of the pixels at an edge that return nothing, 0 to 1.
     pub missing_at_edges: f64,
-    /// How far the projector is to the right of the camera, in metres: what it does not light returns nothing. 0 for none.
+    /// Distance of the projector to the right of the camera, in metres: surfaces that it does not light return nothing. 0 for no shadows.
     pub projector_m: f64,
 }
 
-/// No image is averaged over more frames.
+/// Maximum number of averaged frames.
 pub const MAX_FRAMES: u32 = 1000;
-/// Two depths of a pixel are of the same surface where they differ by less than this, in metres, and so many standard deviations of the noise.
+/// Two depths of a pixel are of the same surface where they differ by less than this, in metres, plus this many standard deviations of the noise.
 const SURFACE_M: f64 = 0.01;
 const NOISE_SIGMAS: f64 = 8.0;
 
 impl Noise {
-    /// A structured-light camera of the usual kind.
+    /// A typical structured-light camera.
     pub const DEFAULT: Noise = Noise { sigma_at_1m: 0.0015, missing: 0.002, missing_at_edges: 0.1, projector_m: 0.075 };
-    /// None at all.
+    /// No noise at all.
     pub const NONE: Noise = Noise { sigma_at_1m: 0.0, missing: 0.0, missing_at_edges: 0.0, projector_m: 0.0 };
 }
 
@@ -41,7 +41,7 @@ impl Default for Noise {
     }
 }
 
-/// The average of frames `first_frame ..` of a scene that stands still; a pixel counts in the frames that returned it.
+/// The average of frames `first_frame ..` of a static scene; a pixel is averaged over the frames that returned it.
 pub fn observe(
     clean: &DepthImage,
     optics: &Intrinsics,
@@ -60,7 +60,7 @@ pub fn observe(
         let truth = f64::from(*truth);
         let missing = if edges[pixel] { noise.missing_at_edges } else { noise.missing };
         let bits = hash(seed ^ hash(first_frame) ^ (pixel as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
-        // How many frames returned it: for many of them about normal, with the binomial's mean and variance.
+        // The number of frames that returned it; for several frames a normal distribution with the binomial's mean and variance.
         let returned = if frames == 1.0 {
             f64::from(u8::from(uniform(hash(bits ^ 1)) >= missing))
         } else {
@@ -74,9 +74,10 @@ pub fn observe(
     DepthImage { width: clean.width, height: clean.height, depth }
 }
 
-/// The average of pictures that are themselves averages of so many frames; a pixel counts where it returned. The camera stood still, the scene
-/// need not have: what passed before the rest is left out of a pixel where the rest was seen, too. Else the average would lie between the two, where
-/// nothing is. So of what differs by more than the noise the farthest counts: an arm that moves hides nothing that any frame shows.
+/// The average of pictures that are themselves averages of several frames; a pixel is averaged over the pictures that returned it. The camera stood
+/// still, but something may have moved through the scene: where both were seen, only the background counts, because an average would lie between the
+/// two surfaces, where nothing is. So among depths that differ by more than the noise the farthest counts: a moving arm hides nothing that any frame
+/// shows.
 pub fn average(
     width: usize,
     height: usize,
@@ -93,7 +94,7 @@ pub fn average(
     DepthImage { width, height, depth: depth.collect() }
 }
 
-/// What several pictures say of a pixel.
+/// The depths of a pixel over several pictures.
 #[derive(Debug, Clone, Copy, Default)]
 struct Pixel {
     farthest: f64,
@@ -102,7 +103,7 @@ struct Pixel {
 }
 
 impl Pixel {
-    /// A depth in metres, 0 for none, that is the average of so many frames.
+    /// Adds a depth in metres (0 for none) that is the average of `frames` frames.
     fn add(&mut self, depth: f64, frames: f64, noise: &Noise) {
         let alike = SURFACE_M + NOISE_SIGMAS * noise.sigma_at_1m * depth * depth;
         if depth <= 0.0 || depth < self.farthest - alike {
@@ -117,7 +118,7 @@ impl Pixel {
     }
 }
 
-/// Close to a standard normal: three uniforms have variance 1/4, so twice their centred sum has 1.
+/// About standard normal: the sum of three uniforms has variance 1/4, so twice the centred sum has variance 1.
 fn normal(bits: u64) -> f64 {
     let [a, b, c] = [bits, bits >> 21, bits >> 42].map(|b| (b & 0x1F_FFFF) as f64 / f64::from(0x20_0000));
     2.0 * (a + b + c - 1.5)
@@ -127,7 +128,7 @@ fn uniform(bits: u64) -> f64 {
     (bits >> 11) as f64 / (1_u64 << 53) as f64
 }
 
-/// The finaliser of SplitMix64 (Steele, Lea, Flood 2014): every input bit reaches every output bit.
+/// The finaliser of SplitMix64 (Steele, Lea, Flood 2014): every input bit affects every output bit.
 fn hash(x: u64) -> u64 {
     let x = x.wrapping_add(0x9E37_79B9_7F4A_7C15);
     let x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -180,8 +181,8 @@ mod tests {
     #[test]
     fn what_passes_before_a_wall_is_not_mixed_with_it() {
         let noise = &Noise { missing: 0.0, missing_at_edges: 0.0, projector_m: 0.0, ..Noise::DEFAULT };
-        // A bar of 20 columns, half a metre before the wall, moves by ten columns from frame to frame; it leaves the last ten columns free at
-        // no time.
+        // A bar of 20 columns, half a metre in front of the wall, moves by ten columns from frame to frame; the last ten columns are covered all the
+        // time.
         let frame = |number: u64, from: usize| {
             let mut clean = wall(1.5);
             for row in clean.depth.chunks_mut(100) {
@@ -195,7 +196,7 @@ mod tests {
         let backwards = average(100, 100, noise, frames.into_iter().rev());
         for (pixel, depth) in seen.depth.iter().enumerate() {
             let (truth, sigma) = if pixel % 100 < 90 { (1.5, 0.0034) } else { (1.0, 0.0015) };
-            // Of eight frames at most two had the bar in this place.
+            // At most two of the eight frames had the bar in this place.
             assert!((depth - truth).abs() < 5.0 * sigma / 6.0_f32.sqrt(), "{pixel}: {depth}");
             assert!((depth - backwards.depth[pixel]).abs() < 1e-6, "{pixel}: the order does not count");
         }
@@ -210,7 +211,7 @@ mod tests {
         let optics = Intrinsics { fx: 400.0, ..Intrinsics::DEFAULT };
         let noise = Noise { projector_m: 0.05, ..Noise::NONE };
         let seen = observe(&step, &optics, &noise, 1, 0, 1);
-        // The near half is 20 columns off for the projector, the far half 10: the last ten columns of it are in the shadow.
+        // To the projector the near half is shifted by 20 columns, the far half by 10: the last ten columns of the far half are in the shadow.
         let dark: Vec<usize> = (0..100).filter(|column| seen.depth[*column] == 0.0).collect();
         assert_eq!(dark, (40..50).collect::<Vec<_>>());
         assert!(observe(&step, &optics, &Noise::NONE, 1, 0, 1).depth.iter().all(|d| *d > 0.0));

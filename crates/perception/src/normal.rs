@@ -1,12 +1,12 @@
-//! Normal equations of small least-squares problems, solved by Cholesky's decomposition.
+//! Normal equations of small least-squares problems, solved by Cholesky decomposition.
 
 use std::collections::BTreeMap;
 
-/// How many unknowns there are at the most.
+/// Maximum number of unknowns.
 pub(crate) const N: usize = 9;
 
-/// What the residuals of a block of neighbours have in common: an error that they share, of a known variance, beside their own. Of each block
-/// the sums of the weights, and of slopes and residuals by them.
+/// Blocks of neighbouring residuals that share an error of known variance in addition to their own. For each block: the sum of the weights,
+/// and the weighted sums of slopes and residuals.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Blocks {
     sums: BTreeMap<[i32; 3], Shared>,
@@ -29,14 +29,14 @@ impl Blocks {
         }
     }
 
-    /// By how much the sum of squares is less where the blocks' errors have this variance.
+    /// The decrease of the sum of squares if the blocks' shared errors have this variance.
     pub(crate) fn relief(&self, variance: f64) -> f64 {
         self.sums.values().map(|block| block.residual.powi(2) * block.gain(variance)).sum()
     }
 }
 
 impl Shared {
-    /// The inverse of `1 / variance + Σ w`: how much of a block's sums is its shared error (Sherman and Morrison 1950).
+    /// The inverse of `1 / variance + Σ w`: the part of a block's sums that is its shared error (Sherman and Morrison 1950).
     fn gain(&self, variance: f64) -> f64 {
         variance / (1.0 + variance * self.weight)
     }
@@ -50,7 +50,7 @@ pub(crate) struct Normal {
 }
 
 impl Normal {
-    /// One more residual with its derivatives.
+    /// Adds a residual with its derivatives.
     pub(crate) fn add(&mut self, slope: &[f64; N], residual: f64, weight: f64) {
         for (row, entries) in self.matrix.iter_mut().enumerate() {
             let weighted = weight * slope[row];
@@ -61,7 +61,7 @@ impl Normal {
         }
     }
 
-    /// The same, where blocks of the residuals share errors of this variance.
+    /// Accounts for shared errors of this variance in blocks of the residuals.
     pub(crate) fn with_shared(mut self, blocks: &Blocks, variance: f64) -> Normal {
         for block in blocks.sums.values() {
             let gain = block.gain(variance);
@@ -70,14 +70,13 @@ impl Normal {
         self
     }
 
-    /// An unknown that is expected to have a value, `residual` less than it has.
+    /// Adds a prior to an unknown; `residual` is the unknown minus its expected value.
     pub(crate) fn expect(&mut self, unknown: usize, residual: f64, weight: f64) {
         self.matrix[unknown][unknown] += weight;
         self.right[unknown] += weight * residual;
     }
 
-    /// The step to subtract, with the diagonal increased by a part of itself (Marquardt 1963). `None` where nothing is
-    /// determined.
+    /// The step to subtract, with the diagonal increased by a part of itself (Marquardt 1963). `None` where the equations are singular.
     pub(crate) fn step(&self, fixed: &[bool; N], damping: f64) -> Option<[f64; N]> {
         let factor = self.factor(fixed, damping)?;
         let mut right = self.right;
@@ -89,7 +88,7 @@ impl Normal {
         Some(solve(&factor, right))
     }
 
-    /// The inverse of the matrix; rows and columns of fixed unknowns are those of 1.
+    /// The inverse of the matrix; rows and columns of fixed unknowns are those of the identity.
     pub(crate) fn inverse(&self, fixed: &[bool; N]) -> Option<[[f64; N]; N]> {
         let factor = self.factor(fixed, 1e-9)?;
         Some(std::array::from_fn(|i| solve(&factor, std::array::from_fn(|j| f64::from(u8::from(i == j))))))
@@ -144,7 +143,8 @@ mod tests {
 
     #[test]
     fn an_error_that_a_block_shares_is_no_measurement_of_each_of_its_residuals() {
-        // Twenty residuals of one unknown, all in a block: by its shared error alone they are worth one of its variance, and one more.
+        // Twenty residuals of one unknown, all in one block: the variance is that of the shared error, plus that of the mean of their own
+        // errors.
         let (mut normal, mut blocks) = (Normal::default(), Blocks::default());
         let slope: [f64; N] = std::array::from_fn(|i| f64::from(u8::from(i == 0)));
         for i in 0..20 {
@@ -154,7 +154,7 @@ mod tests {
         let fixed = std::array::from_fn(|i| i != 0);
         let variance = |shared: f64| normal.with_shared(&blocks, shared).inverse(&fixed).unwrap()[0][0];
         assert!((variance(0.0) - 1.0 / 80.0).abs() < 1e-9 && (variance(0.5) - 0.5 - 1.0 / 80.0).abs() < 1e-9);
-        // Where nothing tells the two apart the solution is the same mean.
+        // Nothing separates the shared error from the unknown, so the solution is still the mean.
         let step = normal.with_shared(&blocks, 0.5).step(&fixed, 0.0).unwrap();
         assert!((step[0] - 0.95).abs() < 1e-9, "{step:?}");
     }

@@ -1,15 +1,15 @@
-//! What a scene looks like to people: every body in its colour, lit from the camera and from above. No sensor sees this.
+//! A picture of a scene for people: every body in its colour, lit from the camera and from above. No sensor uses it.
 
 use crate::camera::Camera;
 use crate::picture::Picture;
 use crate::render::{Body, FAR, parry_pose, rays_at};
 use parry3d::math::Vector;
 
-/// Where nothing is.
+/// The background.
 const SKY: [u8; 3] = [222, 230, 238];
-/// How bright a face is that looks away from both lights.
+/// Brightness of a face that points away from both lights.
 const AMBIENT: f32 = 0.35;
-/// How much brighter it is when it looks into the camera, and when it looks up.
+/// Additional brightness of a face that points to the camera, and of one that points up.
 const HEADLIGHT: f32 = 0.4;
 const LAMP: f32 = 0.25;
 

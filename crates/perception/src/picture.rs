@@ -1,22 +1,22 @@
-//! PNG files to look at: a depth image in colours, with what was found drawn into it.
+//! PNG files to look at: a depth image in colours, with detections drawn into it.
 
 use crate::camera::{Camera, DepthImage};
 use crate::detection::{Detection, Symmetry};
 use ratn_model::pose::Pose;
 use std::f64::consts::TAU;
 
-/// A picture, three bytes a pixel, row by row from the upper left.
+/// A picture, three bytes per pixel, row by row from the upper left.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Picture {
-    /// Columns.
+    /// Number of columns.
     pub width: usize,
-    /// Rows.
+    /// Number of rows.
     pub height: usize,
     /// Red, green and blue of every pixel.
     pub rgb: Vec<u8>,
 }
 
-/// A picture that cannot be written.
+/// Why a picture cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("a picture of {width} × {height} cannot be written as PNG")]
 pub struct PictureError {
@@ -28,16 +28,16 @@ pub struct PictureError {
 /// The colours of outlines and of x axes.
 const OUTLINE: [u8; 3] = [255, 255, 255];
 const AXIS: [u8; 3] = [255, 255, 0];
-/// Straight pieces that a circle is drawn with.
+/// Number of segments of a circle.
 const SIDES: u32 = 48;
-/// Points a line is drawn with.
+/// Number of points of a line.
 const STROKES: usize = 160;
-/// Edges of a box, by the bits of its corners.
+/// Edges of a box; its corners are numbered by bits.
 const EDGES: [(usize, usize); 12] =
     [(0, 1), (0, 2), (1, 3), (2, 3), (4, 5), (4, 6), (5, 7), (6, 7), (0, 4), (1, 5), (2, 6), (3, 7)];
 
 impl Picture {
-    /// A depth image: near is red, far is blue, shaded by the slope of what is seen; black is no return.
+    /// A depth image in colours: near is red, far is blue, shaded by slope; black is no return.
     pub fn of_depth(image: &DepthImage) -> Picture {
         let seen: Vec<f32> = image.depth.iter().copied().filter(|d| *d > 0.0).collect();
         let (near, far) = seen.iter().fold((f32::INFINITY, 0.0_f32), |(near, far), d| (near.min(*d), far.max(*d)));
@@ -54,8 +54,8 @@ impl Picture {
         Picture { width: image.width, height: image.height, rgb }
     }
 
-    /// Draws the outline of what was found: of what is round its circles above and below, of everything else its bounding box and its x
-    /// axis from the middle.
+    /// Draws the outline of a detection: for round objects the circles at the top and the bottom, for all others the bounding box and
+    /// the x axis from the centre.
     pub fn draw(&mut self, camera: &Camera, found: &Detection) {
         let half = found.model.size().map(|edge| edge / 2.0);
         if found.model.class().symmetry() == Symmetry::Round {
@@ -83,7 +83,7 @@ impl Picture {
     /// The picture as a PNG file.
     ///
     /// # Errors
-    /// [`PictureError`] for a picture of no pixels.
+    /// [`PictureError`] for a picture without pixels.
     pub fn to_png(&self) -> Result<Vec<u8>, PictureError> {
         let failed = |source| PictureError { width: self.width, height: self.height, source };
         let mut file = Vec::new();
@@ -111,7 +111,7 @@ impl Picture {
     }
 }
 
-/// How much the depth falls from the pixel above, in metres; 0 where nothing is known.
+/// How much the depth decreases from the pixel above, in metres; 0 where unknown.
 fn slope(image: &DepthImage, pixel: usize) -> f32 {
     let above = pixel.checked_sub(image.width).map_or(0.0, |above| image.depth[above]);
     if above > 0.0 { above - image.depth[pixel] } else { 0.0 }
@@ -159,7 +159,7 @@ mod tests {
         let [column, row] = camera.intrinsics.project([0.1, 0.1, 1.4]).unwrap();
         let pixel = 3 * (row.round() as usize * width + column.round() as usize);
         assert_eq!(&drawn.rgb[pixel..pixel + 3], &[255, 255, 255]);
-        // A bowl is round: its rim is drawn, the corners of the box around it are not.
+        // A bowl is round: its rim is drawn, the corners of its bounding box are not.
         let bowl = Detection { model: ObjectClass::Bowl.model(&[0.08, 0.06]), ..at(0.0) };
         let mut round = blank.clone();
         round.draw(&camera, &bowl);

@@ -15,26 +15,26 @@ pub(crate) struct Plane {
     pub(crate) height: f64,
 }
 
-/// Samples of three points.
+/// Number of samples of three points.
 const ATTEMPTS: usize = 80;
-/// Points that vote; more are thinned out evenly.
+/// Maximum number of points that vote; more are thinned out evenly.
 const VOTERS: usize = 1500;
-/// How far a point of the plane may lie from it, in metres.
+/// Maximum distance of an inlier from the plane, in metres.
 const INLIER: f64 = 0.008;
-/// How steep the plane may be in the region's frame.
+/// Maximum slope of the plane in the region's frame.
 const MAX_SLOPE: f64 = 0.1;
-/// How steep it usually is there: what leads from one surface down to another is steeper.
+/// Standard deviation of that slope: what leads from one surface down to another is steeper.
 const SLOPE_DEVIATION: f64 = 0.03;
-/// With fewer inliers there is no plane.
+/// Minimum number of inliers.
 const MIN_INLIERS: usize = 40;
 
 impl Plane {
-    /// How far a point is above the plane.
+    /// Height of a point above the plane.
     pub(crate) fn above(&self, p: Vector) -> f64 {
         p[2] - self.at(p[0], p[1])
     }
 
-    /// The plane's height at a place.
+    /// The plane's height at a point.
     pub(crate) fn at(&self, x: f64, y: f64) -> f64 {
         self.slope_x * x + self.slope_y * y + self.height
     }
@@ -48,8 +48,8 @@ impl Plane {
         Pose { position: [0.0, 0.0, self.height], quaternion_xyzw: quaternion.map(|q| q / norm) }
     }
 
-    /// The plane that most points lie on, each counting less the steeper and the farther from z = 0 the plane is: by a normal
-    /// distribution with this deviation, in metres. So of two surfaces the one that is meant is found, and where there is one alone, that one.
+    /// The plane with the most inliers, weighted down the steeper it is and the farther it is from z = 0: by a normal distribution with this
+    /// standard deviation, in metres. So of two surfaces the intended one is found, and a single one is found anyway.
     pub(crate) fn find(points: &[Vector], deviation: f64, seed: u64) -> Option<Plane> {
         let stride = points.len().div_ceil(VOTERS).max(1);
         let voters: Vec<Vector> = points.iter().step_by(stride).copied().collect();
@@ -58,7 +58,7 @@ impl Plane {
         }
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let mut best: Option<(f64, Plane)> = None;
-        // Every other sample is of points near where the plane should be: it may be a small part of what is seen.
+        // Every other sample is drawn from points near the expected plane, which may be a small part of the view.
         let near: Vec<Vector> = voters.iter().filter(|p| p[2].abs() < 2.0 * deviation).copied().collect();
         for attempt in 0..ATTEMPTS {
             let from = if attempt % 2 == 0 && near.len() >= MIN_INLIERS { &near } else { &voters };
@@ -156,7 +156,7 @@ mod tests {
 
     #[test]
     fn of_two_surfaces_the_one_that_is_meant_is_found_and_one_alone_is_found_anywhere() {
-        // A board of 5 cm that takes a quarter of the view.
+        // A board, 5 cm above the rest, that covers a quarter of the view.
         let grid = (0..1600).map(|i| (f64::from(i % 40) / 40.0, f64::from(i / 40) / 40.0));
         let points: Vec<Vector> = grid.map(|(x, y)| [x, y, if x < 0.25 { 0.0 } else { -0.05 }]).collect();
         assert!(Plane::find(&points, 0.01, 5).unwrap().height.abs() < 1e-6);

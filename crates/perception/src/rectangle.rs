@@ -1,4 +1,4 @@
-//! The rectangle of least area around points of a plane: one of its sides lies on an edge of their convex hull
+//! The rectangle of least area around points in a plane: one of its sides lies on an edge of their convex hull
 //! (Freeman and Shapira 1975), so every edge is tried.
 
 /// A rectangle in the plane.
@@ -11,7 +11,7 @@ pub(crate) struct Rectangle {
     pub(crate) size: [f64; 2],
 }
 
-/// The rectangle of least area; `None` for fewer than three points or points of one line.
+/// The rectangle of least area; `None` for fewer than three points or collinear points.
 pub(crate) fn least_area(points: &[[f64; 2]]) -> Option<Rectangle> {
     let hull = hull(points);
     if hull.len() < 3 {

@@ -1,8 +1,8 @@
 //! Depth images by ray casting (parry3d).
 //!
-//! One ray per pixel through its centre. A body is only tried for the pixels that the projection of its bounding box
-//! covers, so the cost is about the area that the bodies cover in the image. [`scan`] has, beside the depth, what a sensor's noise
-//! depends on: how obliquely each pixel sees its surface, and how much of the light that surface swallows ([`Surface`]).
+//! One ray per pixel through its centre. A body is only tried for the pixels that the projection of its bounding box covers, so the
+//! cost is about the area that the bodies cover in the image. Besides the depth, [`scan`] computes what a sensor's noise depends
+//! on: how obliquely each pixel sees its surface, and how much of the light that surface swallows ([`Surface`]).
 
 mod grain;
 
@@ -17,20 +17,20 @@ use ratn_world::scene::Shape;
 pub struct Body {
     /// Its shape.
     pub shape: SharedShape,
-    /// Where it is.
+    /// Its pose.
     pub pose: Pose,
 }
 
-/// What a surface does to the light of a depth camera.
+/// Optical properties of a surface for a depth camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Surface {
-    /// How rough it is: the standard deviation of its relief, in metres.
+    /// Roughness: the standard deviation of its relief, in metres.
     pub grain_m: f64,
-    /// How much of it is dark and hardly returns anything, 0 to 1, in patches of about 1 cm.
+    /// The part of it that is dark and hardly returns any light, 0 to 1, in patches of about 1 cm.
     pub dark: f64,
-    /// How much of what returns is lost where it mirrors the projector straight into the camera, 0 to 1.
+    /// The part of the light that is lost where it mirrors the projector straight into the camera, 0 to 1.
     pub gloss: f64,
-    /// Where its relief and its patches begin: another number is another piece of the same material.
+    /// Offset of its relief and its patches: another number is another piece of the same material.
     pub origin: f64,
 }
 
@@ -39,23 +39,24 @@ impl Surface {
     pub const MATT: Surface = Surface { grain_m: 0.0001, dark: 0.0, gloss: 0.0, origin: 0.0 };
 }
 
-/// What can be seen, pixel by pixel.
+/// The visible surface, pixel by pixel.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Rendering {
     /// The true depths.
     pub depth: DepthImage,
     /// The cosine between each pixel's ray and its surface's normal: 1 is seen straight on, 0 edge-on.
     pub facing: Vec<f32>,
-    /// How much of a pixel's light its surface swallows or mirrors away, 0 to 1.
+    /// The part of a pixel's light that its surface swallows or mirrors away, 0 to 1.
     pub lost: Vec<f32>,
 }
 
-/// A surface whose normal is within this cosine of the ray mirrors the projector, which is beside the camera, into it: 5°.
+/// Cosine of the angle (5°) between normal and ray up to which a surface mirrors the projector, which is beside the camera, into
+/// the camera.
 const MIRRORED: f32 = 0.9962;
-/// How much of the light a dark patch swallows.
+/// The part of the light that a dark patch swallows.
 const SWALLOWED: f64 = 0.9;
 
-/// No surface farther than this is seen, in metres.
+/// Maximum visible distance, in metres.
 pub const FAR: f32 = 8.0;
 
 impl Body {
@@ -75,7 +76,7 @@ impl Body {
     }
 }
 
-/// Our pose as parry's.
+/// A pose of the project as a parry pose.
 pub fn parry_pose(pose: &ratn_model::pose::Pose) -> Pose {
     let [x, y, z] = pose.position.map(|c| c as f32);
     let [i, j, k, w] = pose.quaternion_xyzw.map(|c| c as f32);
@@ -104,7 +105,7 @@ pub fn render(camera: &Camera, bodies: &[Body]) -> DepthImage {
     DepthImage { width, height, depth }
 }
 
-/// What the camera can see of bodies with their surfaces, without noise.
+/// The visible surface of bodies with optical properties, without noise.
 pub fn scan(camera: &Camera, bodies: &[(Body, Surface)]) -> Rendering {
     let Intrinsics { width, height, .. } = camera.intrinsics;
     let mut depth = vec![FAR; width * height];
@@ -133,8 +134,8 @@ pub fn scan(camera: &Camera, bodies: &[(Body, Surface)]) -> Rendering {
     Rendering { depth: DepthImage { width, height, depth }, facing, lost }
 }
 
-/// Shows every pixel that a body may cover, with the body's pose and the pixel's ray in the camera's frame. The ray's direction has
-/// z = 1, so a time of impact is a depth.
+/// Calls `show` for every pixel that a body may cover, with the body's pose and the pixel's ray in the camera's frame. The ray's
+/// direction has z = 1, so a time of impact is a depth.
 pub(crate) fn rays_at(camera: &Camera, body: &Body, mut show: impl FnMut(usize, &Pose, Ray)) {
     let seen = parry_pose(&camera.pose).inverse() * body.pose;
     let Some(Window { columns, rows }) = window(&camera.intrinsics, body, &seen) else { return };
@@ -224,7 +225,7 @@ mod tests {
         let scan = |surface| scan(&looking_forward(), &[(wall.clone(), surface)]);
         let shining = scan(Surface { gloss: 0.7, ..Surface::MATT });
         assert!(shining.depth.depth.iter().all(|d| (d - 2.0).abs() < 1e-3));
-        // In the middle it is seen straight on, in a corner at 31°.
+        // The middle is seen straight on, a corner at 31°.
         assert!(shining.facing[120 * 320 + 160] > 0.999 && (shining.facing[0] - 0.856).abs() < 0.01);
         assert!((shining.lost[120 * 320 + 160] - 0.7).abs() < 1e-6 && shining.lost[0] == 0.0);
         let patchy = scan(Surface { dark: 0.2, ..Surface::MATT });

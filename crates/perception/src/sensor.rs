@@ -1,16 +1,16 @@
-//! What a structured-light camera does to the truth, as measured on sensors of the kind of the first Kinect.
+//! The errors of a structured-light camera, as measured on sensors like the first Kinect.
 //!
-//! - Sensor along the ray grows with the square of the distance (Khoshelham and Oude Elberink 2012, equation 10), as of every sensor
-//!   that triangulates: here it is added to the inverse of the depth. It is normal, tails included. A part of it is white; another is
-//!   smooth over some pixels, because neighbours share the window of the pattern that they are matched by, and half of that one's
-//!   variance stays from frame to frame (Mallick, Das and Majumdar 2014, on spatial and temporal noise). The disparity comes in steps
-//!   (Konolige and Mihelich 2012: an eighth of a pixel).
-//! - Across the ray an edge is found to about a pixel (Nguyen, Izadi and Lovell 2012, lateral noise), and some pixels at it return a
-//!   mixture of near and far: flying pixels.
-//! - Nothing comes back from some pixels, from more of them at edges, from surfaces seen almost edge-on, from dark and from mirroring
-//!   ones, nor where something nearer keeps the projector's light away.
+//! - The noise along the ray grows with the square of the distance (Khoshelham and Oude Elberink 2012, equation 10), as for every
+//!   sensor that triangulates: here it is added to the inverse of the depth. It is normal, tails included. Part of it is white;
+//!   another part is smooth over some pixels, because neighbours share the window of the pattern by which they are matched, and half
+//!   of that part's variance stays from frame to frame (Mallick, Das and Majumdar 2014, on spatial and temporal noise). The disparity
+//!   is quantized (Konolige and Mihelich 2012: an eighth of a pixel).
+//! - Across the ray an edge is located to about a pixel (Nguyen, Izadi and Lovell 2012, lateral noise), and some pixels at it return
+//!   a mixture of near and far: flying pixels.
+//! - Some pixels return nothing: more of them at edges, on surfaces seen almost edge-on, on dark and mirroring surfaces, and where
+//!   something nearer blocks the projector's light.
 //!
-//! Every sample is a hash of (seed, frame, pixel), so an image does not depend on the order in which it is made.
+//! Every sample is a hash of (seed, frame, pixel), so an image does not depend on the order in which it is computed.
 
 pub(crate) mod field;
 
@@ -22,41 +22,42 @@ use field::{along_row, hash, normal, uniform};
 use serde::{Deserialize, Serialize};
 use std::f64::consts::{PI, TAU};
 
-/// How noisy a camera is.
+/// The errors of a camera.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Sensor {
-    /// Standard deviation of the white part of a depth at one metre, in metres; grows with the square of the distance.
+    /// Standard deviation of the white noise of a depth at one metre, in metres; grows with the square of the distance.
     pub sigma_at_1m: f64,
-    /// Standard deviation of the smooth part, likewise.
+    /// Standard deviation of the smooth noise, likewise.
     pub smooth_at_1m: f64,
-    /// Over what angle the smooth part is alike, in milliradians.
+    /// Correlation angle of the smooth noise, in milliradians.
     pub smooth_mrad: f64,
-    /// The step of a depth at one metre, in metres; grows likewise. 0 for none.
+    /// Quantization step of a depth at one metre, in metres; grows likewise. 0 for none.
     pub step_at_1m: f64,
-    /// Standard deviation of where an edge is seen, across the ray, in milliradians.
+    /// Standard deviation of an edge's position across the ray, in milliradians.
     pub lateral_mrad: f64,
-    /// How many of the pixels at an edge return a mixture of near and far, 0 to 1.
+    /// The part of the pixels at an edge that return a mixture of near and far, 0 to 1.
     pub flying: f64,
-    /// How many of the pixels return nothing, 0 to 1.
+    /// The part of the pixels that return nothing, 0 to 1.
     pub missing: f64,
-    /// How many of the pixels at an edge return nothing, 0 to 1.
+    /// The part of the pixels at an edge that return nothing, 0 to 1.
     pub missing_at_edges: f64,
-    /// From which angle between ray and normal on pixels get lost, up to all of them at 88°; in degrees. 90 for none.
+    /// Angle between ray and normal from which pixels get lost, increasing to all of them at 88°; in degrees. 90 for none.
     pub grazing_deg: f64,
-    /// How far the projector is to the right of the camera, in metres: what it does not light returns nothing. 0 for none.
+    /// Distance of the projector to the right of the camera, in metres: surfaces that it does not light return nothing. 0 for no
+    /// shadows.
     pub projector_m: f64,
 }
 
-/// How much of the smooth part's variance stays from frame to frame.
+/// The part of the smooth noise's variance that stays from frame to frame.
 const LASTING: f64 = 0.5;
-/// Of an average over more frames, pixels at edges are sampled so often, the rest by the distribution of the mean.
+/// Maximum number of samples of an edge pixel in an average over frames; other pixels are drawn from the distribution of the mean.
 const EDGE_SAMPLES: u32 = 8;
-/// At this angle nothing returns any more.
+/// From this angle on nothing returns.
 const EDGE_ON: f64 = 88.0 * PI / 180.0;
 
 impl Sensor {
-    /// A structured-light camera of the usual kind: 1.5 mm in all at 1 m. A sensor of 640 columns over 52° has 1.5 mrad a pixel.
+    /// A typical structured-light camera: 1.5 mm in total at 1 m. A sensor of 640 columns over 52° has 1.5 mrad per pixel.
     pub const DEFAULT: Sensor = Sensor {
         sigma_at_1m: 0.0013,
         smooth_at_1m: 0.0008,
@@ -69,7 +70,7 @@ impl Sensor {
         grazing_deg: 70.0,
         projector_m: 0.075,
     };
-    /// None at all.
+    /// No errors at all.
     pub const NONE: Sensor = Sensor {
         sigma_at_1m: 0.0,
         smooth_at_1m: 0.0,
@@ -90,7 +91,7 @@ impl Default for Sensor {
     }
 }
 
-/// The average of frames `first_frame ..` of a scene that stands still; a pixel counts in the frames that returned it.
+/// The average of frames `first_frame ..` of a static scene; a pixel is averaged over the frames that returned it.
 pub fn sense(
     seen: &Rendering,
     optics: &Intrinsics,
@@ -130,7 +131,7 @@ pub fn sense(
     DepthImage { width: clean.width, height: clean.height, depth }
 }
 
-/// The smooth part of the inverse depth in a row, in the mean over the frames.
+/// The smooth noise of the inverse depth in a row, averaged over the frames.
 fn smooth_row(optics: &Intrinsics, sensor: &Sensor, seed: u64, of_frames: u64, row: usize, frames: u32) -> Vec<f64> {
     if sensor.smooth_at_1m == 0.0 || sensor.smooth_mrad == 0.0 {
         return vec![0.0; optics.width];
@@ -147,7 +148,7 @@ fn smooth_row(optics: &Intrinsics, sensor: &Sensor, seed: u64, of_frames: u64, r
         .collect()
 }
 
-/// In how many frames a pixel returned: for many of them about normal, with the binomial's mean and variance.
+/// The number of frames in which a pixel returned; for several frames a normal distribution with the binomial's mean and variance.
 fn returned(kept: f64, frames: u32, bits: u64) -> f64 {
     if frames == 1 {
         return f64::from(u8::from(uniform(hash(bits ^ 1)) < kept));
@@ -156,8 +157,8 @@ fn returned(kept: f64, frames: u32, bits: u64) -> f64 {
     (frames * kept + (frames * kept * (1.0 - kept)).sqrt() * normal(hash(bits ^ 1))).round().clamp(0.0, frames)
 }
 
-/// The mean of so many measurements of a depth. White noise and the steps act on its inverse; how far the mean of rounded values is
-/// from the true one is the series of the rounding error with each term damped by the noise (Widrow and Kollár 2008, chapter 5).
+/// The mean of `count` measurements of a depth. White noise and quantization act on its inverse; the bias of the mean of rounded
+/// values is the series of the rounding error with each term damped by the noise (Widrow and Kollár 2008, chapter 5).
 fn measured(truth: f32, sensor: &Sensor, smooth: f64, count: f64, bits: u64) -> f32 {
     let (inverse, sigma, step) = (1.0 / f64::from(truth) + smooth, sensor.sigma_at_1m, sensor.step_at_1m);
     let inverse = if step <= 0.0 {
@@ -173,7 +174,7 @@ fn measured(truth: f32, sensor: &Sensor, smooth: f64, count: f64, bits: u64) -> 
     if inverse > 0.0 { (1.0 / inverse) as f32 } else { 0.0 }
 }
 
-/// The mean of what a pixel at an edge returns: each time the depth a little beside it, or a mixture.
+/// The mean of the returns of a pixel at an edge: each is the depth at a point close by, or a mixture.
 #[expect(clippy::too_many_arguments, reason = "a pixel, what it sees, and the sensor's state there")]
 fn at_edge(
     clean: &DepthImage,
@@ -188,7 +189,7 @@ fn at_edge(
     let Some([near, far]) = edge::around(clean, pixel) else { return 0.0 };
     let (column, row) = ((pixel % clean.width) as f64, (pixel / clean.width) as f64);
     let samples = frames.min(EDGE_SAMPLES);
-    // Each sample stands for some frames.
+    // Each sample stands for several frames.
     let stands_for = f64::from(frames) / f64::from(samples);
     let (mut sum, mut count) = (0.0, 0.0);
     for sample in 0..samples {
@@ -213,7 +214,7 @@ fn at_edge(
     if count > 0.0 { (sum / count) as f32 } else { 0.0 }
 }
 
-/// How many pixels are lost that see their surface under this cosine.
+/// The part of the pixels that are lost where the surface is seen under this cosine.
 fn grazing(sensor: &Sensor, facing: f64) -> f64 {
     let (begins, angle) = (sensor.grazing_deg.to_radians(), facing.clamp(0.0, 1.0).acos());
     if begins >= EDGE_ON || angle <= begins { 0.0 } else { ((angle - begins) / (EDGE_ON - begins)).min(1.0) }
@@ -228,7 +229,7 @@ mod tests {
         Rendering { depth, facing: vec![1.0; 10_000], lost: vec![0.0; 10_000] }
     }
 
-    /// So many columns of a wall, and one twice as near beside them.
+    /// A wall whose columns from `columns` on are at half the distance.
     fn step(columns: usize) -> Rendering {
         let mut step = wall(2.0);
         for row in step.depth.depth.chunks_mut(100) {
@@ -253,7 +254,7 @@ mod tests {
     fn noise_grows_with_the_square_of_the_distance() {
         let near = deviation(&look(1.0, &Sensor::DEFAULT, 1, 0, 1), 1.0);
         let far = deviation(&look(2.0, &Sensor::DEFAULT, 1, 0, 1), 2.0);
-        // White, smooth and rounding together.
+        // White noise, smooth noise and rounding together.
         let expected = (1.3_f64.powi(2) + 0.8_f64.powi(2) + 2.5_f64.powi(2) / 12.0).sqrt() * 1e-3;
         assert!((near / expected - 1.0).abs() < 0.1, "{near}");
         assert!((far / near - 4.0).abs() < 0.5, "{far}");
@@ -292,7 +293,7 @@ mod tests {
             let at = 1.0 / f64::from(*d) / steps.step_at_1m;
             (at - at.round()).abs() < 1e-3
         }));
-        // The mean as the series has it is the mean of single frames.
+        // The mean by the series equals the mean of single frames.
         for truth in [1.0, 1.0006, 1.0013] {
             let mean = |frames, looks: u64| {
                 let of = |look_no| {
@@ -313,7 +314,7 @@ mod tests {
             let between = |d: &&f32| (1.1..1.9).contains(*d);
             seen.depth.chunks(100).flat_map(|row| row[columns.clone()].iter()).filter(between).count()
         };
-        // A quarter of 200 pixels, nine tenths of which return, four fifths of that far from either side.
+        // Of 200 pixels a quarter fly, nine tenths of these return, and four fifths of those are far from either side.
         assert!((20..60).contains(&flying(49..51)), "{}", flying(49..51));
         assert_eq!(flying(0..48) + flying(52..100), 0);
     }
@@ -344,7 +345,8 @@ mod tests {
         let optics = Intrinsics { fx: 400.0, ..OPTICS };
         let noise = Sensor { projector_m: 0.05, ..Sensor::NONE };
         let seen = sense(&step, &optics, &noise, 1, 0, 1);
-        // The near half is 20 columns off for the projector, the far half 10: the last ten columns of it are in the shadow.
+        // To the projector the near half is shifted by 20 columns, the far half by 10: the last ten columns of the far half are in
+        // the shadow.
         let dark: Vec<usize> = (0..100).filter(|column| seen.depth[*column] == 0.0).collect();
         assert_eq!(dark, (40..50).collect::<Vec<_>>());
         assert!(sense(&step, &optics, &Sensor::NONE, 1, 0, 1).depth.iter().all(|d| *d > 0.0));

@@ -1,9 +1,10 @@
-//! What things look like to the camera: triangle meshes with the details that real things have.
+//! Realistic objects for the camera: triangle meshes with the details that real objects have.
 //!
 //! Nothing here is shared with the models that the detector fits ([`crate::model`]): boxes have bevels, cans have seams and a
-//! sunken lid, cups have handles and a wall that tapers, bowls and plates stand on a foot and curve in their own ways, forks have
-//! tines and a bent neck. Only the outer sizes and the frame are agreed upon: the middle of the bounding box, z up; a handle
-//! sticks out of it. Details are drawn from a number, so that no two things are alike and the same one always looks the same.
+//! sunken lid, cups have handles and a tapering wall, bowls and plates stand on a foot and have individual curves, forks have
+//! tines and a bent neck. Only the outer dimensions and the frame are the same: the centre of the bounding box, z up; a handle
+//! sticks out of the box. Details are derived from a seed, so that no two objects are alike and the same one always looks the
+//! same.
 
 mod can;
 mod carton;
@@ -20,22 +21,22 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::f64::consts::TAU;
 
-/// What distinguishes one thing from another of the same class and size.
+/// What distinguishes an object from others of the same class and dimensions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Individual {
-    /// What its details are derived from.
+    /// Seed of its details.
     pub seed: u64,
     /// Whether it has a handle; only cups do.
     pub has_handle: bool,
 }
 
-/// How far a handle reaches beyond a cup's radius at the most, in metres.
+/// How far a handle reaches beyond a cup's radius at most, in metres.
 pub const HANDLE_M: f64 = 0.034;
-/// One of so many cups has no handle.
+/// One in this many cups has no handle.
 const TUMBLERS: u64 = 4;
 
 impl Individual {
-    /// The thing of this class and these dimensions: always the same one.
+    /// The individual for this class and these dimensions: always the same one.
     pub fn of(model: &Model) -> Individual {
         let mix = |seed: u64, dimension: &f64| {
             (seed ^ dimension.to_bits()).wrapping_mul(0x9E37_79B9_7F4A_7C15).rotate_left(29)
@@ -45,13 +46,13 @@ impl Individual {
         Individual { seed, has_handle }
     }
 
-    /// The same without a handle.
+    /// The same individual without a handle.
     pub fn without_handle(self) -> Individual {
         Individual { has_handle: false, ..self }
     }
 }
 
-/// The thing's shape in its frame, and what its surface does to light.
+/// The object's shape in its frame, and the optical properties of its surface.
 pub fn drawn(model: &Model, individual: Individual) -> (SharedShape, Surface) {
     let random = &mut ChaCha8Rng::seed_from_u64(individual.seed);
     let [x, y, z] = model.size();
@@ -67,7 +68,7 @@ pub fn drawn(model: &Model, individual: Individual) -> (SharedShape, Surface) {
     (mesh.shape(), surface)
 }
 
-/// Cardboard is rough, metal and glaze shine; print and labels are dark in places.
+/// Cardboard is rough, metal and glaze are glossy; print and labels are dark in places.
 fn surface(class: ObjectClass, random: &mut impl Rng) -> Surface {
     let (grain_mm, dark, gloss) = match class {
         ObjectClass::Box => (0.1..0.4, 0.06, 0.0),

@@ -1,23 +1,23 @@
-//! The silhouette of a cluster: where a pixel sees it and one beside that sees far past it.
+//! The silhouette of a cluster: where one pixel sees the cluster and the next sees far past it.
 //!
-//! Along rows and columns, from each pixel of the cluster outwards: over pixels that fly, whose mixtures say that the edge is among them,
-//! to one that sees the surface. What a camera with a projector loses beside something near is surface in its shadow, so an edge is before
-//! what is missing. Where the cluster meets the surface there is no edge: only what is high enough to hide something counts.
+//! The search goes outwards along rows and columns from each pixel of the cluster: over flying pixels, among whose mixtures the edge lies,
+//! to a pixel that sees the surface. Missing pixels beside a near object are surface in the projector's shadow, so the edge comes before
+//! them. Where the cluster meets the surface there is no edge: only points high enough to hide something count.
 
-/// What a pixel says of the surface.
+/// What a pixel tells about the surface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Sight {
-    /// Nothing came back.
+    /// No return.
     Missing,
-    /// The surface, or what is behind and below it: nothing stands in the way.
+    /// It sees the surface, or something behind and below it: nothing stands in the way.
     Free,
     /// A mixture of near and far.
     Flying,
-    /// Something that stands on the surface, or hides it.
+    /// It sees something that stands on the surface, or hides it.
     Standing,
 }
 
-/// Where an edge is in the image, in pixels, and within how many.
+/// Position of an edge in the image, and its standard deviation, in pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Crossing {
     pub(crate) column: f64,
@@ -25,11 +25,11 @@ pub(crate) struct Crossing {
     pub(crate) sigma: f64,
 }
 
-/// Not more pixels than this are between something and the surface behind it: shadows are as wide.
+/// Maximum number of pixels between an object and the surface behind it: the width of shadows.
 const WIDEST: isize = 6;
-/// Not more of them fly.
+/// Maximum number of flying pixels among them.
 const MOST_FLYING: i32 = 4;
-/// Within how many pixels an edge is seen where none flies: sensors find it to about a pixel.
+/// Standard deviation of an edge without flying pixels, in pixels: sensors locate it to about a pixel.
 const EDGE: f64 = 0.7;
 
 /// The edges beside a pixel of a cluster. `sights` are row by row.
@@ -63,10 +63,10 @@ pub(crate) fn beside(sights: &[Sight], width: usize, pixel: usize) -> impl Itera
     })
 }
 
-/// How far around an edge its direction is told from, in pixels.
+/// Radius around an edge from which its direction is estimated, in pixels.
 const AROUND: f64 = 2.6;
 
-/// The direction across an edge, outwards: along columns and rows. `None` where as much is outside on either side.
+/// The outward direction across an edge, in columns and rows. `None` where both sides have as much outside.
 pub(crate) fn outwards(sights: &[Sight], width: usize, at: &Crossing) -> Option<[f64; 2]> {
     let rows = sights.len() / width;
     let (mut right, mut down) = (0.0, 0.0);

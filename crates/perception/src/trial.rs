@@ -1,8 +1,8 @@
-//! Random tables, and how well detection does on them: what tests and measurements share.
+//! Random tables, and how well detection does on them: shared by tests and measurements.
 //!
-//! One to eight objects of all classes and of random dimensions stand on a table as the robot's mast sees it, at least
-//! [`GAP_M`] apart, and so that each shows most of what it would show alone: what stands behind something else is found when the
-//! robot looks from elsewhere, and is no matter of estimation.
+//! One to eight objects of all classes and of random dimensions stand on a table as seen from the robot's mast, at least [`GAP_M`] apart,
+//! and so that most of each object is visible: an object behind another one is found when the robot looks from elsewhere, which is not what
+//! these trials measure.
 
 use crate::calibration::Calibration;
 use crate::camera::{Camera, DepthImage, Intrinsics};
@@ -21,76 +21,76 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 /// A structured-light camera of 640 × 480 pixels, 52° × 40°.
 pub const OPTICS: Intrinsics = Intrinsics { width: 640, height: 480, fx: 660.0, fy: 660.0, cx: 319.5, cy: 239.5 };
-/// The middle of the table's top, in metres.
+/// The centre of the table's top, in metres.
 pub const TABLE: [f64; 3] = [0.80, 0.0, 0.70];
-/// The table's top, in metres.
+/// The size of the table's top, in metres.
 pub const TABLE_SIZE: [f64; 2] = [0.6, 1.2];
-/// Between the circles around two objects, or what of them a fork is, in metres.
+/// Gap between the circles around two objects (or around parts of a fork), in metres.
 pub const GAP_M: f64 = 0.03;
-/// How much of what an object would show alone it shows on its table.
+/// Minimum visible part of an object, compared with the object alone.
 pub const LEAST_VISIBLE: f64 = 0.75;
-/// What is found is within this of the truth: metres and radians.
+/// Tolerances of a detection: metres and radians.
 pub const TOLERANCE: (f64, f64) = (0.005, 3.0 * PI / 180.0);
-/// Something found farther than this from everything is false, in metres.
+/// A detection farther than this from every object is false, in metres.
 const ASSIGNED: f64 = 0.05;
 /// Boxes whose edges differ by less than this look the same after a quarter turn, in metres.
 const SQUARE: f64 = 0.01;
 
-/// An object in its place.
+/// An object with its pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Placed {
-    /// What it is.
+    /// Its model.
     pub model: Model,
-    /// The middle of its bounding box, in the world.
+    /// The centre of its bounding box, in the world.
     pub pose: Pose,
 }
 
-/// How one object was found.
+/// The detection of one object.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Match {
-    /// What it is.
+    /// The object.
     pub truth: Placed,
-    /// As what it was found, if at all.
+    /// Its detection, if any.
     pub found: Option<Detection>,
-    /// Between the centres, in metres.
+    /// Distance between the centres, in metres.
     pub position: f64,
-    /// Between the axes, modulo the symmetry, in radians.
+    /// Angle between the axes, modulo the symmetry, in radians.
     pub angle: f64,
 }
 
 impl Match {
-    /// Of the right class, within the tolerance.
+    /// Whether the class is right and the errors are within the tolerance.
     pub fn is_good(&self) -> bool {
         let right = self.found.is_some_and(|f| f.model.class() == self.truth.model.class());
         right && self.position <= TOLERANCE.0 && self.angle <= TOLERANCE.1
     }
 
-    /// Whether the position is within the ellipsoid that its covariance gives 95 % to.
+    /// Whether the position is within the 95 % ellipsoid of its covariance.
     pub fn is_inside(&self) -> Option<bool> {
-        // The 95 % of a χ² distribution with three degrees of freedom.
+        // The 95 % quantile of a χ² distribution with three degrees of freedom.
         self.normalised_square().map(|square| 3.0 * square <= 7.815)
     }
 
-    /// The position's squared error by its covariance, over its three dimensions: 1 in the mean where covariances are true, less
-    /// where they are too large (the normalised estimation error squared; Bar-Shalom, Li and Kirubarajan 2001, section 5.4).
+    /// The squared position error weighted by the inverse covariance, divided by its three dimensions: 1 on average where covariances are
+    /// right, less where they are too large (the normalised estimation error squared; Bar-Shalom, Li and Kirubarajan 2001, section 5.4).
     pub fn normalised_square(&self) -> Option<f64> {
         let found = self.found?;
         let e: [f64; 3] = std::array::from_fn(|i| found.pose.position[i] - self.truth.pose.position[i]);
         let [a, b, c]: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|j| found.covariance[i][j]));
-        // By Cramer's rule: symmetric, so rows are columns.
+        // By Cramer's rule: the matrix is symmetric, so rows are columns.
         let determinant = |a, b, c| dot(a, cross(b, c));
         let solution = [determinant(e, b, c), determinant(a, e, c), determinant(a, b, e)];
         Some(dot(solution, e) / determinant(a, b, c) / 3.0)
     }
 }
 
-/// A camera where the robot's mast holds it, that looks at the table's middle from 1.85 m.
+/// A camera on the robot's mast that looks at the table's centre from 1.85 m.
 pub fn mast_camera(intrinsics: Intrinsics) -> Camera {
     Camera::looking([-0.62, 0.0, 1.88], TABLE, intrinsics)
 }
 
-/// Where a camera is that the robot takes to be at `believed`: its place and direction along and about the axes of its optical frame are off
-/// by as much as its calibration says. The same seed gives the same error.
+/// The true camera where the robot believes it to be at `believed`: displaced along and rotated about the axes of its optical frame by
+/// random errors with the variances of its calibration. The same seed gives the same error.
 pub fn miscalibrated(believed: &Camera, calibration: &Calibration, seed: u64) -> Camera {
     let off = |axis: usize| calibration[axis].sqrt() * normal(hash(hash(seed ^ 0xCA11) ^ axis as u64));
     let error = Pose::from_rpy([off(0), off(1), off(2)], off(3), off(4), off(5));
@@ -102,7 +102,7 @@ pub fn region() -> Region {
     Region { pose: Pose::at(TABLE[0], TABLE[1], TABLE[2]), size: TABLE_SIZE }
 }
 
-/// A random object of a class: any yaw, dimensions in the middle of the class's ranges.
+/// A random model of a class: dimensions in the middle of the class's ranges.
 pub fn random_model(class: ObjectClass, random: &mut impl Rng) -> Model {
     let dimensions: Vec<f64> = match class {
         ObjectClass::Box => {
@@ -118,17 +118,17 @@ pub fn random_model(class: ObjectClass, random: &mut impl Rng) -> Model {
     class.model(&dimensions)
 }
 
-/// A table with so many objects, as the camera will see each of them: each is exactly its model. The same seed gives the same table.
+/// A table with `count` objects, each exactly its model. The same seed gives the same table.
 pub fn random_table(seed: u64, count: usize, camera: &Camera) -> Vec<Placed> {
     laid(seed, count, camera, Drawn::Models)
 }
 
-/// The same with room for the handles of cups, and seen as [`things_image`] shows it.
+/// The same with room for the handles of cups, and visible as [`things_image`] shows it.
 pub fn random_things(seed: u64, count: usize, camera: &Camera) -> Vec<Placed> {
     laid(seed, count, camera, Drawn::Things)
 }
 
-/// As what an object is seen.
+/// How objects are drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Drawn {
     /// As the detector's own model.
@@ -140,7 +140,7 @@ enum Drawn {
 fn laid(seed: u64, count: usize, camera: &Camera, drawn: Drawn) -> Vec<Placed> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut table: Vec<Placed> = Vec::new();
-    // A table so full that nothing fits is laid anew.
+    // A table so full that nothing more fits is laid again.
     let mut failures = 0;
     while table.len() < count {
         let class = ObjectClass::ALL[random.random_range(0..ObjectClass::ALL.len())];
@@ -165,13 +165,13 @@ fn laid(seed: u64, count: usize, camera: &Camera, drawn: Drawn) -> Vec<Placed> {
     table
 }
 
-/// What the camera shows of a table, averaged over frames, with the table, the floor and the robot's base.
+/// The camera's image of a table, averaged over frames, with the table, the floor and the robot's base.
 pub fn table_image(table: &[Placed], camera: &Camera, noise: &Noise, seed: u64, frames: u32) -> DepthImage {
     let bodies: Vec<Body> = table.iter().map(Placed::body).chain(surroundings()).collect();
     observe(&render(camera, &bodies), &camera.intrinsics, noise, seed, 0, frames)
 }
 
-/// The same with what is on the table drawn by [`crate::shapes`], as a real sensor would see it.
+/// The same with objects drawn by [`crate::shapes`], as a real sensor would see them.
 pub fn things_image(table: &[Placed], camera: &Camera, sensor: &Sensor, seed: u64, frames: u32) -> DepthImage {
     let surroundings = surroundings().map(|body| (body, Surface::MATT));
     let bodies: Vec<(Body, Surface)> = table.iter().map(Placed::thing).chain(surroundings).collect();
@@ -190,7 +190,7 @@ fn surroundings() -> impl Iterator<Item = Body> {
     .map(|(size, pose)| Body::new(&Shape::Box { size }, &pose))
 }
 
-/// Which objects were found, how well, and what was found that is not there. Nearest pairs first.
+/// Matches objects and detections, nearest pairs first; returns the matches, and the false detections.
 pub fn compare(table: &[Placed], found: &[Detection]) -> (Vec<Match>, Vec<Detection>) {
     let mut pairs: Vec<(usize, usize, f64)> = (0..table.len())
         .flat_map(|t| (0..found.len()).map(move |f| (t, f, table[t].pose.distance(&found[f].pose))))
@@ -215,7 +215,7 @@ pub fn compare(table: &[Placed], found: &[Detection]) -> (Vec<Match>, Vec<Detect
     (matches, found.iter().zip(taken).filter(|(_, taken)| !taken).map(|(f, _)| *f).collect())
 }
 
-/// The least turn from the found pose to one that looks like the truth.
+/// The least rotation from the detected pose to one that looks like the true pose.
 fn angle(truth: &Placed, found: &Pose) -> f64 {
     let turned = |yaw: f64| truth.pose.compose(&Pose::from_rpy([0.0; 3], 0.0, 0.0, yaw)).angle(found);
     let least = |turns: &[f64]| turns.iter().map(|yaw| turned(*yaw)).fold(f64::INFINITY, f64::min);
@@ -234,18 +234,18 @@ fn angle(truth: &Placed, found: &Pose) -> f64 {
 }
 
 impl Placed {
-    /// The thing that it is, with the details of its own, and its surface.
+    /// The object with its individual details, and its surface.
     pub fn thing(&self) -> (Body, Surface) {
         let (shape, surface) = drawn(&self.model, Individual::of(&self.model));
         (Body { shape, pose: crate::render::parry_pose(&self.pose) }, surface)
     }
 
-    /// Its model.
+    /// The object's model as a body.
     pub fn body(&self) -> Body {
         Body { shape: self.model.solid(), pose: crate::render::parry_pose(&self.pose) }
     }
 
-    /// Circles that hold it, seen from above: one, or four along something slender.
+    /// Circles that enclose it, seen from above: one, or four along a slender object.
     fn circles(&self, drawn: Drawn) -> Vec<([f64; 2], f64)> {
         let [length, width, _] = self.model.size();
         let pieces = if length > 3.0 * width { 4 } else { 1 };
@@ -261,7 +261,7 @@ impl Placed {
     }
 }
 
-/// Whether the last object has room beside the others.
+/// Whether the last object has enough distance from the others.
 fn is_clear(table: &[Placed], drawn: Drawn) -> bool {
     let Some((last, others)) = table.split_last() else { return true };
     let apart = |a: &([f64; 2], f64), b: &([f64; 2], f64)| (a.0[0] - b.0[0]).hypot(a.0[1] - b.0[1]) > a.1 + b.1 + GAP_M;
@@ -269,7 +269,7 @@ fn is_clear(table: &[Placed], drawn: Drawn) -> bool {
     others.iter().flat_map(|other| other.circles(drawn)).all(|other| own.iter().all(|circle| apart(circle, &other)))
 }
 
-/// Whether every object shows enough of itself. A coarse image does.
+/// Whether every object is visible enough, in a coarse image.
 fn all_visible(table: &[Placed], camera: &Camera, drawn: Drawn) -> bool {
     let optics = camera.intrinsics;
     let scale = 4.0;

@@ -1,5 +1,5 @@
-//! The image sorted by what each pixel says of a surface: it sees something that stands on it, or the surface is free there,
-//! or nobody knows.
+//! Classifies each pixel of the image by what it tells about a surface: it sees something that stands on the surface, or the surface is free
+//! there, or that is unknown.
 
 use crate::camera::{Camera, DepthImage};
 use crate::cluster;
@@ -14,69 +14,70 @@ use crate::silhouette::{self, Sight};
 use crate::vector::{Vector, cross, dot, length, median, scale, sub};
 use ratn_model::pose::Pose;
 
-/// How far above or below its given pose the surface may be, in metres.
+/// Maximum height of the surface above or below its given pose, in metres.
 const PLANE_SLACK: f64 = 0.06;
-/// Nothing taller stands on the surface, in metres.
+/// Maximum height of objects on the surface, in metres.
 const TALLEST: f64 = 0.25;
-/// Something is seen by at least so many pixels.
+/// Minimum number of pixels of an object.
 const MIN_PIXELS: usize = 40;
-/// So many deviations above the plane nothing belongs to it any more, and not less or more than these, in metres.
+/// Height above the plane in standard deviations from which a point does not belong to it, and the limits of that height, in metres.
 const CLEAR_OF_PLANE: f64 = 3.5;
 const CLEARANCE: std::ops::RangeInclusive<f64> = 0.0035..=0.014;
-/// What is this many deviations higher is hardly ever taken for the plane.
+/// Points this many standard deviations higher are hardly ever taken for the plane.
 const UNBIASED: f64 = 1.5;
-/// Points that the plane is estimated from, about; the rest are left out evenly.
+/// Approximate number of points from which the plane is estimated; the rest are left out evenly.
 const PLANE_POINTS: usize = 12_000;
-/// The least part of a depth's deviation that counts as height above the plane: a camera that looks along it says nothing else.
+/// Minimum part of a depth's standard deviation that counts as height above the plane, for a camera that looks along the plane.
 const LEAST_FALL: f64 = 0.2;
-/// The least part of a ray that is taken for level: straight from above no wall is seen.
+/// Minimum horizontal part of a ray: from straight above no wall is seen.
 const LEAST_LEVEL: f64 = 0.3;
-/// An edge is on the far side of something where the way across it goes up by this cosine: nothing else says where it ends there.
+/// An edge is on the far side of an object where the direction across it goes up by this cosine: nothing else determines where the object ends
+/// there.
 const UPWARDS: f64 = 0.6;
-/// How far outside of the silhouette the rays are whose distance from a model is compared, in pixels.
+/// Distance from the silhouette of the rays whose distance from a model is compared, in pixels.
 const BESIDE_EDGE: f64 = 2.5;
-/// What is so many deviations nearer than what a ray met has been passed by it.
+/// A ray has passed points that are this many standard deviations nearer than what it met.
 const PASSED: f64 = 3.0;
-/// What is higher than a wall of so many pixels, and than noise in so many deviations, hides some of the surface behind it.
+/// A point hides some of the surface behind it if it is higher than a wall of this many pixels plus this many standard deviations of noise.
 const HIDES: (f64, f64) = (2.0, 4.0);
-/// A depth is not more certain than this, in metres.
+/// Minimum standard deviation of a depth, in metres.
 const LEAST_SIGMA: f64 = 0.0004;
-/// Which pixels around a cluster's are asked whether they see past it, in steps along rows and columns.
+/// Which pixels around a cluster's pixel are checked for seeing past it, in steps along rows and columns.
 const BESIDE: [isize; 4] = [1, 2, 3, 5];
-/// How far around a fork, along it and across, depths are compared with what they should be, and how high above or below the surface, in metres.
+/// The region around a fork in which depths are compared: beyond it along and across, and above or below the surface, in metres.
 const AROUND: [f64; 2] = [0.035, 0.012];
 const LOW: f64 = 0.035;
-/// Not more of them, about.
+/// Approximate maximum number of these depths.
 const MOST_DEPTHS: f64 = 1200.0;
-/// What stands on the plane lifts it by about so much of its points' deviation: low parts are taken for it.
+/// Objects on the plane lift its estimate by about this part of its points' standard deviation, because low parts are taken for the plane.
 const LIFT: f64 = 0.08;
-/// No cluster.
+/// The pixel belongs to no cluster.
 const NOBODY: u16 = u16::MAX;
-/// RANSAC's choices: any number does; the same image gives the same objects.
+/// Seed of RANSAC's choices: any number will do; the same image gives the same objects.
 const SEED: u64 = 0x5EED;
 
-/// What is seen on a surface.
+/// The view of a surface.
 pub(crate) struct View<'a> {
     image: &'a DepthImage,
     rays: Rays,
-    /// What each pixel says of the surface.
+    /// What each pixel tells about the surface.
     sights: Vec<Sight>,
-    /// The surface's frame in the world: on the plane as seen, its z axis the plane's normal.
+    /// The surface's frame in the world: on the measured plane, with z along its normal.
     pub(crate) frame: Pose,
-    /// What stands on it: pixels, the largest cluster first.
+    /// What stands on it: pixels by cluster, largest first.
     pub(crate) clusters: Vec<Vec<Seen>>,
-    /// Of each cluster, which ones of the first it is made of.
+    /// For each cluster, the original clusters that it consists of.
     parts: Vec<[u16; 2]>,
-    /// Of each pixel, which of the first clusters it belongs to.
+    /// For each pixel, the original cluster that it belongs to.
     owners: Vec<u16>,
-    /// Standard deviation of a depth, and of a height above the surface, in metres.
+    /// Standard deviations of a depth, and of a height above the surface, in metres.
     sigma: f64,
     sigma_above: f64,
-    /// Of what the noise of neighbouring pixels has in common, in metres of depth.
+    /// Standard deviation of the noise that neighbouring pixels share, in metres of depth.
     shared: f64,
     /// See [`Evidence`].
     floor: f64,
-    /// How well the plane is known: the variance of its height, in metres², and of its slope.
+    /// Uncertainty of the plane: the variance of its height, in metres², and of its slope.
     pub(crate) plane_variance: [f64; 2],
 }
 
@@ -87,7 +88,7 @@ pub(crate) struct Seen {
     pub(crate) point: Vector,
 }
 
-/// Every pixel's ray in a frame: its direction is linear in column and row.
+/// The rays of all pixels in a frame: their direction is linear in column and row.
 struct Rays {
     eye: Vector,
     origin: Vector,
@@ -114,7 +115,7 @@ impl Rays {
         std::array::from_fn(|i| self.eye[i] + depth * way[i])
     }
 
-    /// The direction of a pixel's ray: times the depth it is the way from the eye.
+    /// The direction of a pixel's ray: multiplied by the depth, it is the vector from the eye.
     fn way(&self, column: usize, row: usize) -> Vector {
         self.way_at(column as f64, row as f64)
     }
@@ -126,7 +127,7 @@ impl Rays {
     /// Column and row at which a point appears; `None` behind the camera.
     fn pixel(&self, point: Vector) -> Option<[f64; 2]> {
         let to = sub(point, self.eye);
-        // The axes are orthogonal, those of columns and rows as long as a pixel at a depth of 1.
+        // The axes are orthogonal; those of columns and rows have the length of a pixel at a depth of 1.
         let ahead = cross(self.per_column, self.per_row);
         let depth = dot(to, ahead) / length(ahead);
         let at = |axis: Vector| (dot(to, axis) / depth - dot(self.origin, axis)) / dot(axis, axis);
@@ -135,7 +136,7 @@ impl Rays {
 }
 
 impl<'a> View<'a> {
-    /// `deviation`: how far from its given pose the surface is, in metres, as a normal distribution's.
+    /// `deviation` is the standard deviation of the surface from its given pose, in metres.
     ///
     /// # Errors
     /// [`DetectionError`] when the surface is not in the image.
@@ -174,7 +175,7 @@ impl<'a> View<'a> {
             owners: vec![NOBODY; image.depth.len()],
             sigma: (sigma_above / fall).max(LEAST_SIGMA),
             floor: clear_in_mean + UNBIASED * sigma_in_mean,
-            // The variance of places spread evenly over the region's shorter edge is a third of its half, squared.
+            // Points spread evenly over the region's shorter edge have a variance of a third of half its length, squared.
             plane_variance: [variance + (LIFT * sigma_above).powi(2), variance * 3.0 / half[0].min(half[1]).powi(2)],
         };
         let mask = Mask::new(body, &frame, [half[0], half[1], TALLEST]);
@@ -184,8 +185,8 @@ impl<'a> View<'a> {
         Ok(view)
     }
 
-    /// Marks what is free, and says what stands within the region: what is itself clear of the plane, and what is so in the mean
-    /// with the pixels around it.
+    /// Marks free pixels, and returns the points within the region that stand on the surface: those that are clear of the plane themselves, and
+    /// those whose mean with the pixels around them is.
     fn sort(&mut self, clear: f64, clear_in_mean: f64, within: impl Fn(&Vector) -> bool) -> Vec<Seen> {
         let heights = self.heights();
         let width = self.image.width;
@@ -218,14 +219,14 @@ impl<'a> View<'a> {
         above
     }
 
-    /// How much higher an upright wall is by a pixel where this one sees it, in metres.
+    /// Height of an upright wall per pixel where this pixel sees it, in metres.
     fn rise(&self, pixel: usize) -> f64 {
         let way = self.rays.way(pixel % self.image.width, pixel / self.image.width);
         let level = (way[0].hypot(way[1]) / length(way)).max(LEAST_LEVEL);
         f64::from(self.image.depth[pixel]) * length(self.rays.per_row) / level
     }
 
-    /// How far each pixel's point is above the surface, in metres; not a number where nothing came back.
+    /// Height of each pixel's point above the surface, in metres; NaN for no return.
     fn heights(&self) -> Vec<f32> {
         let rays = &self.rays;
         let mut heights = Vec::with_capacity(self.image.depth.len());
@@ -248,7 +249,7 @@ impl<'a> View<'a> {
         let points: Vec<Vector> = above.iter().map(|seen| seen.point).collect();
         let clusters = cluster::clusters(&points, MIN_PIXELS).into_iter();
         let seen = clusters.map(|members| members.into_iter().map(|i| above[i as usize]).collect::<Vec<Seen>>());
-        // What the image cuts off is not known to its end.
+        // Clusters that the image cuts off are not known as a whole.
         self.clusters = seen.filter(|cluster| !cluster.iter().any(at_border)).collect();
         for (number, cluster) in self.clusters.iter().enumerate() {
             self.parts.push([number as u16; 2]);
@@ -256,7 +257,7 @@ impl<'a> View<'a> {
         }
     }
 
-    /// Two clusters as one more, unless their middles are farther apart than `most`.
+    /// Adds the union of two clusters as another cluster, unless their centroids are farther apart than `most`.
     pub(crate) fn joined(&mut self, a: usize, b: usize, most: f64) -> Option<usize> {
         let parts = [self.parts[a][0], self.parts[b][0]];
         let [a, b] = [a, b].map(|cluster| &self.clusters[cluster]);
@@ -272,7 +273,8 @@ impl<'a> View<'a> {
         Some(self.clusters.len() - 1)
     }
 
-    /// At most `points` of a cluster's points, evenly, and at most `free` of the rays beside it.
+    /// The evidence of a cluster: at most `points` of its points, evenly, at most `free` of the rays beside it, and at most `edges` of its
+    /// edges.
     pub(crate) fn evidence(&self, cluster: usize, [points, free, edges]: [usize; 3]) -> Evidence {
         let members = &self.clusters[cluster];
         let beside = self.beside(cluster);
@@ -290,13 +292,13 @@ impl<'a> View<'a> {
         }
     }
 
-    /// How far a ray has surely passed, in metres of depth: where it met something, noise may have put it a little behind.
+    /// How far a ray has passed for certain, in metres of depth: noise may have put the point that it met a little behind.
     fn passed(&self, pixel: usize) -> f64 {
         let depth = f64::from(self.image.depth[pixel]);
         if self.sights[pixel] == Sight::Standing { depth - PASSED * self.sigma } else { depth }
     }
 
-    /// At most so many rays along a cluster's silhouette, evenly.
+    /// At most `most` rays along a cluster's silhouette, evenly.
     fn edges(&self, cluster: usize, most: usize) -> Vec<Edge> {
         let width = self.image.width;
         let hides =
@@ -313,7 +315,7 @@ impl<'a> View<'a> {
             let (to_surface, away) = (-self.rays.eye[2] / way[2], length(sub(*point, self.rays.eye)));
             let [from, to] = [edge, way].map(|way| scale(way, 1.0 / length(way)));
             let (turn, level) = (length(sub(to, from)), from[0].hypot(from[1]).max(LEAST_LEVEL));
-            // At the sides, points and the rays past them say where it ends.
+            // At the sides, points and the rays past them already determine where the object ends.
             if (to[2] - from[2]) / turn < UPWARDS * level {
                 return None;
             }
@@ -328,7 +330,7 @@ impl<'a> View<'a> {
         crossings.iter().step_by(stride).filter_map(edge).collect()
     }
 
-    /// The depths around a fork, as it lies now.
+    /// The depths around a fork in its present pose.
     pub(crate) fn relief(&self, fit: &Fit) -> Relief {
         let [long, width, height] = fit.model().size();
         let (along, across) = (long / 2.0 + AROUND[0], width / 2.0 + AROUND[1]);
@@ -351,7 +353,7 @@ impl<'a> View<'a> {
             for column in range(0) {
                 let Some(depth) = valid(self.image.depth[row * self.image.width + column]) else { continue };
                 let way = self.rays.way(column, row);
-                // Where the ray reaches the surface, and how high what it met is.
+                // The point at which the ray reaches the surface, and the height of the point that it met.
                 let surface = -self.rays.eye[2] / way[2];
                 let (u, v) = (self.rays.eye[0] + surface * way[0] - x, self.rays.eye[1] + surface * way[1] - y);
                 let beside = (cos * u + sin * v).abs() > along || (cos * v - sin * u).abs() > across;
@@ -371,7 +373,7 @@ impl<'a> View<'a> {
         }
     }
 
-    /// Pixels beside a cluster that see past it, the surface or another cluster, each once.
+    /// Pixels beside a cluster that see past it, to the surface or to another cluster, each once.
     fn beside(&self, cluster: usize) -> Vec<usize> {
         let own = self.parts[cluster];
         let passes = |pixel: usize| match self.sights[pixel] {
@@ -402,7 +404,7 @@ impl<'a> View<'a> {
     }
 }
 
-/// Points about where the surface should be, of every so many columns and rows.
+/// Points near the expected surface, on a grid of columns and rows.
 fn near_surface(image: &DepthImage, camera: &Camera, region: &Region) -> Vec<Vector> {
     let half = region.size.map(|edge| edge / 2.0);
     let rough = Rays::new(camera, &region.pose);
@@ -415,8 +417,8 @@ fn near_surface(image: &DepthImage, camera: &Camera, region: &Region) -> Vec<Vec
     near.collect()
 }
 
-/// How much the points of a plane scatter about it, and how many there are: 1.4826 times the median distance is a normal
-/// distribution's deviation, whatever stands on the plane.
+/// The scatter of the points of a plane about it, and their number: 1.4826 times the median distance is a normal distribution's standard
+/// deviation, whatever stands on the plane.
 fn scatter(points: &[Vector], plane: &Plane) -> (f64, f64) {
     let mut off: Vec<f64> = points.iter().map(|p| plane.above(*p).abs()).filter(|off| *off < 0.02).collect();
     (1.4826 * median(&mut off).unwrap_or(0.0), off.len() as f64)

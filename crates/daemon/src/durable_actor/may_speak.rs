@@ -10,8 +10,8 @@
 //!
 //! # Why a predecessor does no harm
 //!
-//! Let a successor take the place at T. Every check of the predecessor that begins after T fails, so the predecessor sends nothing after T
-//! + G.
+//! Let a successor take the place at T. Every check of the predecessor that begins after T fails, so the predecessor sends nothing after
+//! T + G.
 //!
 //! - *Sessions.* A client trusts its session until the time at which it sent its last answered ping, plus the time to live (TTL). The
 //!   predecessor answers no ping that was sent after T + G, so no client trusts it beyond T + G + TTL. The successor restores the session

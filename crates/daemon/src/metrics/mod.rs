@@ -1,6 +1,7 @@
 //! Metrics of a daemon for Prometheus: in the OpenMetrics text format, at `/metrics` of a separate listener.
 //!
-//! Made once for each daemon and given to every part that counts something. Serving them is separate ([`listen`]). Labels take few values: methods of this system, gRPC codes, reasons of refusals; never what a client sent.
+//! Made once per daemon and given to every part that counts something. Serving the metrics is separate ([`listen`]). Labels have few values: methods of this
+//! system, gRPC codes, reasons of refusals; never text from a client.
 
 mod listener;
 

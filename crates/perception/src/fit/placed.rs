@@ -1,16 +1,16 @@
-//! A model in its place, ready for many questions: how far points are from it, and how deep rays pass through it.
+//! A model with its pose, prepared for many queries: distances of points, and how deep rays pass through it.
 
 use super::{EDGE_CUT_OFF, Edge, Evidence, Fit};
 use crate::model::Model;
 use crate::model::form::Form;
 use crate::vector::{Vector, length, sub};
 
-/// How exactly the deepest place of a ray is found, in metres.
+/// Resolution of the search for a ray's deepest point, in metres.
 const RESOLUTION: f64 = 0.002;
-/// A ray that stays farther from the model than this passes well clear, in metres.
+/// A ray that stays farther from the model than this does not matter, in metres.
 pub(super) const NEAR: f64 = 0.004;
 
-/// A fit ready for many questions.
+/// A fit prepared for many queries.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Placed {
     model: Model,
@@ -18,14 +18,14 @@ pub(super) struct Placed {
     at: Vector,
     sin: f64,
     cos: f64,
-    /// The camera in its frame.
+    /// The camera in the model's frame.
     eye: Vector,
 }
 
-/// The place of a ray that is deepest within the model, or nearest to it.
+/// The point of a ray that is deepest within the model, or nearest to it.
 pub(super) struct Deepest {
     pub(super) place: Vector,
-    /// Signed distance there.
+    /// The signed distance there.
     pub(super) depth: f64,
 }
 
@@ -39,12 +39,12 @@ impl Placed {
         placed
     }
 
-    /// How far a point is from the surface that the camera sees.
+    /// Distance of a point from the surface that the camera sees.
     pub(super) fn distance(&self, point: Vector) -> f64 {
         self.model.distance(self.form, self.local(point), self.eye)
     }
 
-    /// How far a point is from what no ray passes.
+    /// Distance of a point from the volume that no ray passes.
     pub(super) fn fill_distance(&self, point: Vector) -> f64 {
         self.model.fill_distance(self.form, self.local(point))
     }
@@ -55,13 +55,13 @@ impl Placed {
         [self.cos * x + self.sin * y, self.cos * y - self.sin * x, p[2] - self.at[2]]
     }
 
-    /// Where a ray beside the silhouette is nearest; `None` far from the model.
+    /// The nearest point of a ray beside the silhouette; `None` far from the model.
     pub(super) fn at_edge(&self, evidence: &Evidence, edge: &Edge) -> Option<Deepest> {
         self.deepest(evidence, edge.end, edge.beside + EDGE_CUT_OFF * edge.sigma)
     }
 
-    /// Where the ray from the eye to `end` is deepest, above the floor; `None` where it stays farther from the model than `near`. Golden section: along
-    /// a line the distance to a convex body has one minimum.
+    /// The deepest point of the ray from the eye to `end`, above the floor; `None` where the ray stays farther from the model than `near`. By
+    /// golden-section search: along a line the distance to a convex body has one minimum.
     pub(super) fn deepest(&self, evidence: &Evidence, end: Vector, near: f64) -> Option<Deepest> {
         let eye = evidence.eye;
         let fall = eye[2] - end[2];
@@ -73,7 +73,7 @@ impl Placed {
             let t = (eye[2] - z) / fall;
             std::array::from_fn(|i| eye[i] + t * (end[i] - eye[i]))
         };
-        // What is nearest to a ray that passes over an edge is above that.
+        // The nearest point of a ray that passes over an edge lies above the edge.
         let (top, bottom) = (at((height + near).min(eye[2])), at(end[2].max(evidence.floor)));
         if self.passes_clear(top, bottom, long.hypot(width) / 2.0 + near) {
             return None;
@@ -86,7 +86,7 @@ impl Placed {
         let (mut depth_a, mut depth_b) = (depth(a), depth(b));
         let mut left = length(sub(bottom, top));
         while left > RESOLUTION {
-            // Distances change by no more than the way: nothing within what is left gets near.
+            // A distance changes by no more than the way along the ray, so nothing in the remaining interval comes near.
             if depth_a.min(depth_b) > (1.0 - GOLDEN) * left + near {
                 return None;
             }

@@ -1,10 +1,10 @@
-//! A fork fitted to the depths of all pixels around it, those that see it and those that see the surface alike.
+//! Fits a fork to the depths of all pixels around it, both those that see the fork and those that see the surface.
 //!
-//! A fork is hardly higher than the noise of a single frame. To tell its points from the surface first, and fit to those, gives
-//! away what the rest say and keeps what noise has lifted. Here nothing is told apart: each pixel has the depth that its ray
-//! would have if the fork lay there, or the surface's, or at an edge the mean of both with the variance of not knowing which;
-//! the fork is where all of them together are likeliest (a matched filter; Turin 1960), by Gauss and Newton. So the inverse of
-//! the normal equations is the covariance.
+//! A fork is hardly higher than the noise of a single frame. Separating its points from the surface first, and fitting to those, loses the
+//! information of the others and keeps those that noise has lifted. Here nothing is separated: each pixel is compared with the depth that its ray
+//! would have if the fork lay there, or with the surface's depth, or at an edge with the mean of both and the variance of not knowing which. The
+//! fit maximizes the likelihood of all depths (a matched filter; Turin 1960), by Gauss and Newton. So the inverse of the normal equations is the
+//! covariance.
 
 use super::{Covariance, FIRST_DIMENSION, FIRST_FORM, Fit};
 use crate::level;
@@ -16,22 +16,22 @@ use std::f64::consts::PI;
 /// Depths around a fork, in the frame of the surface.
 #[derive(Debug, Clone)]
 pub(crate) struct Relief {
-    /// Where the camera is.
+    /// Position of the camera.
     pub(crate) eye: Vector,
-    /// What was measured.
+    /// The measured depths.
     pub(crate) depths: Vec<Depth>,
     /// Standard deviation of a depth, in metres.
     pub(crate) sigma: f64,
-    /// Standard deviation of what the noise of neighbouring pixels has in common, in metres.
+    /// Standard deviation of the noise that neighbouring pixels share, in metres.
     pub(crate) shared: f64,
     /// The distance between neighbouring pixels' rays, in metres.
     pub(crate) pitch: f64,
 }
 
-/// What one pixel measured.
+/// The measurement of one pixel.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Depth {
-    /// The ray's direction; times the depth it is the way from the eye.
+    /// The ray's direction; multiplied by the depth, it is the vector from the eye.
     pub(crate) way: Vector,
     /// Along the optical axis, in metres.
     pub(crate) depth: f64,
@@ -39,7 +39,8 @@ pub(crate) struct Depth {
     pub(crate) pixel: [i32; 2],
 }
 
-/// Of each parameter whether a fit finds it, the step of its numeric derivative and the longest step of an iteration; metres, radians, parts.
+/// For each parameter: whether it is fitted, the step of its numeric derivative, and the maximum step of an iteration; in metres, radians, or
+/// parts.
 const FREE: [(bool, f64, f64); MAX_PARAMETERS] = [
     (true, 5e-4, 0.008),
     (true, 5e-4, 0.008),
@@ -51,27 +52,27 @@ const FREE: [(bool, f64, f64); MAX_PARAMETERS] = [
     (true, 1e-3, 0.004),
     (true, 0.02, 0.1),
 ];
-/// What is usual of a fork's length: its mean and deviation, in metres.
+/// Prior of a fork's length: mean and standard deviation, in metres.
 const USUAL_LENGTH: (f64, f64) = (0.19, 0.015);
-/// Rows and columns of a block of pixels that share noise.
+/// Side of a block of pixels that share noise, in pixels.
 const BLOCK: i32 = level::BLOCK as i32;
-/// By how much a fork must explain the depths better than the surface alone does, as a sum of squares by their variance.
+/// Minimum improvement over the surface alone, as a sum of squared residuals divided by their variance.
 const LEAST_GAIN: f64 = 120.0;
-/// How much larger variances are than the normal equations say, as measured on random tables of exact forks, much the same from near, from far and
-/// with ten frames: pixels do not see the soft edges that they are compared with.
+/// Factor from the variances of the normal equations to the true ones. Measured on random tables of exact forks, with about the same result from
+/// near, from far and with ten frames. The cause: pixels do not see the soft edges that they are compared with.
 const EXCESS: f64 = 2.2;
-/// How wide an edge is, in pixels: they are longer on the surface than across their rays.
+/// Width of an edge, in pixels: edges are wider on the surface than across their rays.
 const EDGE: f64 = 1.5;
-/// A residual beyond so many deviations counts no more than this.
+/// A residual counts at most as this many standard deviations.
 const CUT_OFF: f64 = 4.0;
-/// A step below which it has settled, as a part of the longest one.
+/// A fit has settled when a step is below this, as a part of the maximum step.
 const SETTLED: f64 = 0.006;
-/// Where along a fork is tried to begin with, in metres.
+/// Initial shifts along the fork that are tried, in metres.
 const SHIFTS: [f64; 9] = [-0.048, -0.036, -0.024, -0.012, 0.0, 0.012, 0.024, 0.036, 0.048];
 
 impl Relief {
-    /// Forks near this one to begin with, the likeliest first: either way round, and along it, since of a fork whose ends are lost in
-    /// noise the middle is known badly.
+    /// Initial fits near this one, best first: in both directions and shifted along the fork, because the middle of a fork whose ends are lost in
+    /// noise is known only roughly.
     pub(crate) fn starts(&self, around: &Fit) -> Vec<Fit> {
         let few = Relief { depths: self.depths.iter().step_by(3).copied().collect(), ..*self };
         let (sin, cos) = around.yaw().sin_cos();
@@ -92,8 +93,8 @@ impl Relief {
         starts.into_iter().map(|(_, start)| start).collect()
     }
 
-    /// The fork near this one that is likeliest, how badly it explains the depths (the sum of the squares of their residuals by their
-    /// variance, and that variance's logarithm), and how uncertain it is.
+    /// The most likely fork near this one, its cost (the sum of squared residuals divided by their variance, plus that variance's logarithm), and
+    /// its covariance.
     pub(crate) fn refined(&self, start: Fit, iterations: usize) -> (Fit, f64, Covariance) {
         debug_assert_eq!(start.class, ObjectClass::Fork);
         let (mut here, mut damping) = (start, 1e-3);
@@ -129,18 +130,18 @@ impl Relief {
             }
         }
         let unknown = std::array::from_fn(|i| std::array::from_fn(|j| if i == j { super::UNKNOWN } else { 0.0 }));
-        // What the depths scatter more than their noise does is the fork's being unlike the model, and neighbours share that.
+        // Scatter beyond the noise is the fork's deviation from the model, which neighbouring pixels share.
         let unlike = (self.scatter(&expected) - 1.0).max(0.0) * self.sigma.powi(2);
         let normal = self.normal(&here, &expected, self.shared.powi(2) + unlike);
         let covariance = normal.inverse(&fixed).map_or(unknown, |inverse| inverse.map(|row| row.map(|c| EXCESS * c)));
         let pose = std::array::from_fn(|row| std::array::from_fn(|column| covariance[row][column]));
-        // Its height follows its length.
+        // Its height is proportional to its length.
         let grows = here.model().size()[2] / here.parameters[FIRST_DIMENSION];
         let height = covariance[FIRST_DIMENSION][FIRST_DIMENSION] * grows * grows;
         (here, cost, Covariance { pose, height })
     }
 
-    /// The mean square of the residuals by their variance.
+    /// The mean squared residual divided by its variance.
     fn scatter(&self, expected: &[(f64, f64)]) -> f64 {
         let squares = self
             .depths
@@ -150,7 +151,7 @@ impl Relief {
         squares.sum::<f64>() / self.depths.len().max(1) as f64
     }
 
-    /// Whether a fork that explains the depths so badly explains them better than the surface alone.
+    /// Whether a fork with this cost explains the depths better than the surface alone.
     pub(crate) fn shows(&self, cost: f64) -> bool {
         let mut blocks = Blocks::default();
         let square = |depth: &Depth| {
@@ -165,7 +166,7 @@ impl Relief {
         squares - blocks.relief(self.shared.powi(2)) - cost > LEAST_GAIN
     }
 
-    /// The depth of each pixel and its variance, if the fork lay so.
+    /// The expected depth of each pixel and its variance, for this fork.
     fn expected(&self, fit: &Fit) -> Vec<(f64, f64)> {
         let (strip, length) = (Strip::new(fit.form()), fit.parameters[FIRST_DIMENSION]);
         let (sin, cos) = fit.yaw().sin_cos();
@@ -234,13 +235,13 @@ impl Relief {
 }
 
 impl Depth {
-    /// Which pixels share its noise.
+    /// The block of pixels that shares its noise.
     fn block(&self) -> [i32; 3] {
         [self.pixel[0] / BLOCK, self.pixel[1] / BLOCK, 0]
     }
 }
 
-/// Of each parameter that has a usual value how far it is from that, and by what deviation.
+/// Parameters with a prior: index, deviation from the mean, and standard deviation.
 fn usual(fit: &Fit) -> impl Iterator<Item = (usize, f64, f64)> {
     let length = (FIRST_DIMENSION, fit.parameters[FIRST_DIMENSION] - USUAL_LENGTH.0, USUAL_LENGTH.1);
     let form = fit.form();

@@ -1,4 +1,4 @@
-//! Where a fit begins: the cluster's principal axes seen from above, and its height.
+//! Initial values of a fit: the cluster's principal axes seen from above, and its height.
 
 use super::Fit;
 use crate::model::ObjectClass;
@@ -6,35 +6,35 @@ use crate::rectangle;
 use crate::vector::{Vector, median, quantile};
 use std::f64::consts::PI;
 
-/// A cluster in short, in metres.
+/// Summary of a cluster, in metres.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Outline {
-    /// The middle of its extents along the principal axes.
+    /// The centre of its extents along the principal axes.
     middle: [f64; 2],
     /// The direction of the longer axis.
     yaw: f64,
     /// Extents along the longer and the shorter axis.
     extent: [f64; 2],
-    /// How high it is.
+    /// Its height.
     height: f64,
 }
 
-/// Points left out at each end of an extent: strays.
+/// Part of the points left out at each end of an extent, as outliers.
 const TAIL: f64 = 0.005;
-/// How far from its class's range a visible extent may be, as a part of it: partly hidden, or blurred.
+/// Tolerance of a visible extent against its class's range, as a part of it: objects may be partly hidden or blurred.
 const SLACK: f64 = 0.25;
 /// Points of the top face are within this of its height, in metres.
 const TOP: f64 = 0.010;
 
-/// How much of a fork is seen at least, as a part of its length.
+/// Minimum visible part of a fork's length.
 const FORK_IN_PARTS: f64 = 0.65;
-/// The upper part of what is round, in which it has no handle, as a part of its height.
+/// Upper part of a round object that has no handle, as a part of its height.
 const RING: f64 = 0.15;
-/// A handle moves the middle of the extents by more than this, in metres.
+/// A handle shifts the centre of the extents by more than this, in metres.
 const HANDLE: f64 = 0.006;
 
 impl Outline {
-    /// The principal axes of the points seen from above (Pearson 1901), by the closed form for two dimensions.
+    /// The principal axes of the points seen from above (Pearson 1901), in closed form for two dimensions.
     pub(crate) fn of(points: &[Vector]) -> Option<Outline> {
         let count = points.len() as f64;
         let mean = [0, 1].map(|axis| points.iter().map(|p| p[axis]).sum::<f64>() / count);
@@ -61,7 +61,7 @@ impl Outline {
         })
     }
 
-    /// Fits to begin with, of the classes that the outline could be.
+    /// Initial fits of the classes that are possible for this outline.
     pub(crate) fn starts(&self, points: &[Vector], classes: &[ObjectClass]) -> Vec<Fit> {
         classes.iter().filter(|class| self.could_be(**class)).flat_map(|class| self.starts_of(*class, points)).collect()
     }
@@ -73,7 +73,7 @@ impl Outline {
         match class {
             ObjectClass::Box => within(self.height, *ranges[2].start(), *ranges[2].end()) && long > *ranges[0].start(),
             ObjectClass::Fork => {
-                // Head and handle come apart where the bow is as low as noise.
+                // The head and the handle may be separated where the bow is as low as the noise.
                 within(long, FORK_IN_PARTS * ranges[0].start(), *ranges[0].end())
                     && short < 0.4 * long
                     && self.height < 0.035
@@ -104,7 +104,7 @@ impl Outline {
         }
     }
 
-    /// Around what is round at the top: the middle of the extents there, and half of them. A handle is lower.
+    /// The circle at the top of a round object: the centre of the extents there, and half of them. A handle is lower.
     fn top_ring(&self, points: &[Vector]) -> Option<([f64; 2], f64)> {
         let top = points.iter().filter(|p| p[2] > (1.0 - RING) * self.height);
         let along = |axis: usize| {
@@ -115,7 +115,8 @@ impl Outline {
         Some(([(x.0 + x.1) / 2.0, (y.0 + y.1) / 2.0], (x.1 - x.0).max(y.1 - y.0) / 2.0))
     }
 
-    /// The least rectangle around a box's top face: where its sides are alike, the principal axes say nothing of its yaw.
+    /// The rectangle of least area around a box's top face: for a square face the principal axes do not determine the
+    /// yaw.
     fn top_rectangle(&self, points: &[Vector]) -> Option<Fit> {
         let mut upper: Vec<f64> = points.iter().map(|p| p[2]).filter(|h| *h > self.height - TOP).collect();
         let height = median(&mut upper)?;

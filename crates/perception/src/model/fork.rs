@@ -1,21 +1,21 @@
-//! A fork on a table: it touches with the end of its handle and the bow of its head; the neck and the tips stand up.
+//! A fork on a table: it touches the table with the end of its handle and the bow of its head; the neck and the tips stand up.
 //!
-//! A bent strip along x: nodes give its height and width, everything grows with its length.
+//! A bent strip along x: nodes give its height and width, and everything scales with its length.
 
 use super::form::{BOW, Form, GAPS, RISE};
 use crate::vector::Vector;
 
-/// One cross section, of a fork of unit length.
+/// A cross section of a fork of unit length.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Node {
-    /// Along the fork, from -0.5 at the handle's end to 0.5 at the tips.
+    /// Position along the fork, from -0.5 at the handle's end to 0.5 at the tips.
     pub(super) x: f64,
-    /// The strip's middle above the table.
+    /// Height of the strip's middle above the table.
     pub(super) z: f64,
     pub(super) width: f64,
 }
 
-/// Of a table fork of 190 mm: 22 mm wide, its neck 17 mm above the table.
+/// For a table fork of 190 mm: 22 mm wide, its neck 17 mm above the table.
 pub(super) const NODES: [Node; 6] = [
     Node { x: -0.50, z: 0.0085, width: 0.100 },
     Node { x: -0.15, z: 0.0480, width: 0.065 },
@@ -25,18 +25,18 @@ pub(super) const NODES: [Node; 6] = [
     Node { x: 0.50, z: 0.0640, width: 0.115 },
 ];
 
-/// How much of a bow that is lower lowers each node.
+/// How much each node goes down with a lower bow.
 const BENT: [f64; NODES.len()] = [0.0, 0.0, 0.0, 0.7, 1.0, 0.0];
 
 /// The strip's thickness.
 pub(super) const THICKNESS: f64 = 0.015;
 
-/// What is nearer than this below the strip counts as closed for rays: hardly any gets there from above, and a strip of 3 mm would
-/// not keep its own ends where the rays beside it say.
+/// Thickness below the strip that counts as closed for rays: hardly any ray gets there from above, and the edges of a strip of 3 mm
+/// would not lie where the rays beside it say.
 const UNDER: f64 = 0.05;
-/// How much of a tine's pitch is metal; the rest is the gap.
+/// Part of a tine's pitch that is metal; the rest is the gap.
 pub(super) const TINE: f64 = 0.62;
-/// Tines, in the last part of the head.
+/// Number of tines, in the last part of the head.
 pub(super) const TINES: usize = 4;
 
 /// Its bounding box.
@@ -44,8 +44,8 @@ pub(super) fn size(length: f64) -> [f64; 3] {
     [length, 0.125 * length, (0.0840 + THICKNESS / 2.0) * length]
 }
 
-/// Signed distance from the strip's upper side, with everything under it counted as its inside: that is what is seen from above,
-/// and a point that noise has put under a strip of 3 mm still pulls it down. Gaps between tines do not count.
+/// Signed distance from the strip's upper side, with everything under it inside: the camera sees it from above, and a point that
+/// noise has put under a strip of 3 mm still pulls the strip down. Gaps between tines are ignored.
 pub(super) fn distance(length: f64, point: Vector) -> f64 {
     let (above, aside) = offsets(length, point);
     let across = above - THICKNESS / 2.0;
@@ -59,11 +59,11 @@ pub(super) fn fill_distance(length: f64, point: Vector) -> f64 {
     length * ((across.max(0.0).powi(2) + aside.max(0.0).powi(2)).sqrt() + across.max(aside).min(0.0))
 }
 
-/// The strip in parts, as rays from above meet it: of a fork of unit length in its frame, but with z = 0 at the table.
+/// The strip in straight parts, for rays from above: of a fork of unit length in its frame, but with z = 0 at the table.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Strip {
     parts: [Part; NODES.len() - 1],
-    /// How much of a tine's pitch is metal at its root and, less, at its tip.
+    /// Part of a tine's pitch that is metal, at its root and at its tip, where it is less.
     metal: [f64; 2],
 }
 
@@ -73,9 +73,9 @@ struct Part {
     start: [f64; 2],
     along: [f64; 2],
     length: f64,
-    /// At its start, and how much it grows by a unit of length.
+    /// Width at its start, and growth per unit of length.
     width: [f64; 2],
-    /// Whether a free end is at its start, and at its end.
+    /// Whether its start and its end are free ends.
     ends: [bool; 2],
 }
 
@@ -102,10 +102,10 @@ impl Strip {
         Strip { parts, metal: [TINE - 0.5 * form[GAPS], TINE - 1.5 * form[GAPS]].map(|metal| metal.max(0.05)) }
     }
 
-    /// How much of a pixel sees the strip, 0 to 1, and how far along its ray, in lengths of `way`. A pixel is as wide as `pixel`; of
-    /// the tines' gaps it sees as much as their sides leave open.
+    /// The part of a pixel that sees the strip, 0 to 1, and the distance along its ray, in lengths of `way`. `pixel` is the width of
+    /// a pixel; through the tines' gaps it sees as much as their sides leave open.
     pub(crate) fn met(&self, eye: Vector, way: Vector, pixel: f64) -> Option<(f64, f64)> {
-        // Where the ray is half-way up the fork; within how much of that it passes all heights of it.
+        // The point of the ray at half the fork's height, and how far the ray moves while it passes all heights of the fork.
         let half = size(1.0)[2] / 2.0;
         let down = way[2].min(-1e-9);
         let at = (half - eye[2]) / down;
@@ -136,7 +136,7 @@ impl Part {
         if fall > -1e-9 {
             return None;
         }
-        // Through the upper side and out of the lower one.
+        // The ray enters through the upper side and leaves through the lower one.
         let [enters, leaves] = [THICKNESS / 2.0, -THICKNESS / 2.0].map(|side| (side - off) / fall);
         let [s, s_leaving] = [enters, leaves].map(|t| ux * (ex + t * way[0]) + uz * (ez + t * way[2]));
         let (low, high) = (s.min(s_leaving), s.max(s_leaving));
@@ -158,7 +158,7 @@ impl Part {
             let tine = metal[0] + (metal[1] - metal[0]) * (s / self.length).clamp(0.0, 1.0);
             covered *= (tine + (y - y_leaving).abs() / pitch).min(1.0);
         }
-        // Through a side or an end of the strip it is met later.
+        // A ray that enters through a side or an end meets the strip later.
         let later = |outside: f64, way: f64| if outside > 0.0 { (outside / way.abs().max(1e-9)).min(1.0) } else { 0.0 };
         let aside = later(y.abs() - width / 2.0, y - y_leaving);
         let past = if self.ends[0] { -s } else { 0.0 }.max(if self.ends[1] { s - self.length } else { 0.0 });
@@ -167,11 +167,11 @@ impl Part {
     }
 }
 
-/// For a fork of unit length: how far a point is above the strip's middle (below is negative), and beside its edge.
+/// For a fork of unit length: how far a point is above the strip's middle (negative below), and beside its edge.
 fn offsets(length: f64, point: Vector) -> (f64, f64) {
     let [x, y, z] = point.map(|c| c / length);
     let z = z + size(1.0)[2] / 2.0;
-    // The square of the distance, its sign, the width there.
+    // The squared distance, its sign, and the width there.
     let mut nearest = (f64::INFINITY, 1.0, 0.0);
     for pair in NODES.windows(2) {
         let (a, b) = (pair[0], pair[1]);
@@ -180,7 +180,7 @@ fn offsets(length: f64, point: Vector) -> (f64, f64) {
         let t = along.clamp(0.0, 1.0);
         let from = (x - a.x - t * dx).powi(2) + (z - a.z - t * dz).powi(2);
         if from < nearest.0 {
-            // Beyond the strip's ends there is nothing below it.
+            // Beyond the strip's ends nothing is below it.
             let under = (z - a.z) * dx < (x - a.x) * dz && (-0.5..=0.5).contains(&x);
             nearest = (from, if under { -1.0 } else { 1.0 }, a.width + t * (b.width - a.width));
         }

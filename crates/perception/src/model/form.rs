@@ -1,29 +1,28 @@
-//! What individuals of a class differ in beside their dimensions: the form of a wall, the lid of a can. A model by itself has the form 0; a
-//! fit finds the form, because what is fitted is never quite its model, and the form that is usual keeps it from wandering off where
-//! little of it is seen.
+//! Differences between individuals of a class apart from their dimensions: the shape of a wall, the lid of a can. The model itself has form 0. A fit
+//! estimates the form, because a real object never equals its model, and a prior keeps the form plausible where little of the object is seen.
 
 use super::ObjectClass;
 use std::ops::RangeInclusive;
 
-/// How much an individual differs from its model: of a box [`ROUNDED`], of what is round [`BELLY`] and [`LIFT`], of a fork [`RISE`], [`BOW`] and [`GAPS`].
+/// How an individual differs from its model: a box by [`ROUNDED`], round objects by [`BELLY`] and [`LIFT`], a fork by [`RISE`], [`BOW`] and [`GAPS`].
 pub(crate) type Form = [f64; FORMS];
-/// How many numbers a form has.
+/// Numbers in a form.
 pub(crate) const FORMS: usize = 3;
-/// How much farther out the wall is below the rim than the model's, in metres.
+/// How much farther out than the model's the wall below the rim is, in metres.
 pub(crate) const BELLY: usize = 0;
 /// The radius by which a box's edges are rounded, in metres.
 pub(crate) const ROUNDED: usize = 0;
-/// How much higher the bottom of something hollow is than the model's, and how much a can's lid, in metres.
+/// How much higher than the model's the bottom of a hollow object or the lid of a can is, in metres.
 pub(crate) const LIFT: usize = 1;
 
-/// How much higher a fork rises than the model, as a part.
+/// How much higher a fork is than the model, as a part of the model's height.
 pub(crate) const RISE: usize = 0;
 /// How much lower the bow of its head is, as a part of its length.
 pub(crate) const BOW: usize = 1;
 /// How much less metal there is between the gaps of its tines, as a part of their width.
 pub(crate) const GAPS: usize = 2;
 
-/// What is usual of a number of a form: a normal distribution, and within what it is.
+/// The prior of a number of a form: a normal distribution, and its allowed range.
 #[derive(Debug, Clone)]
 pub(crate) struct Usual {
     pub(crate) mean: f64,
@@ -31,20 +30,20 @@ pub(crate) struct Usual {
     pub(crate) range: RangeInclusive<f64>,
 }
 
-/// Nothing differs.
+/// No deviation.
 const NONE: Usual = Usual { mean: 0.0, deviation: 0.0, range: 0.0..=0.0 };
 
 impl Usual {
-    /// Whether it may differ at all.
+    /// Whether it may deviate at all.
     pub(crate) fn is_free(&self) -> bool {
         self.deviation > 0.0
     }
 }
 
 impl ObjectClass {
-    /// How far off an object is beyond what its fit knows, along its axis, across, and up, as deviations in metres. As measured on things with
-    /// details of their own (`crate::shapes`) and a sensor with flying pixels and noise that lasts (`crate::sensor`). Forks and plates are so
-    /// without any noise, by their form; the others by noise that a whole object shares and by edges, and no number of frames makes that less.
+    /// Errors beyond the fit's covariance: standard deviations in metres along the object's axis, across, and up. Measured with objects that have details
+    /// of their own (`crate::shapes`) and a sensor with flying pixels and lasting noise (`crate::sensor`). Forks and plates have these errors without any
+    /// noise, because of their form; the others because of edges and of noise that a whole object shares, and more frames do not reduce it.
     pub(crate) fn off_beyond_fit(self) -> [f64; 3] {
         match self {
             ObjectClass::Box => [0.0005, 0.0005, 0.0002],
@@ -52,12 +51,12 @@ impl ObjectClass {
             ObjectClass::Cup => [0.0005, 0.0005, 0.0006],
             ObjectClass::Bowl => [0.0005, 0.0005, 0.0004],
             ObjectClass::Plate => [0.0006, 0.0006, 0.0005],
-            // Where along it neck and bow are differs from fork to fork, and its ends are low.
+            // The positions of neck and bow differ from fork to fork, and its ends are low.
             ObjectClass::Fork => [0.0026, 0.0012, 0.0005],
         }
     }
 
-    /// What is usual of this class's forms: crockery has a foot of a few millimetres below its bottom and curves of its own, lids are sunken.
+    /// The prior of this class's forms: crockery has a foot of a few millimetres below its bottom and its own curves, lids are sunken.
     pub(crate) fn usual(self) -> &'static [Usual; FORMS] {
         const HOLLOW: Usual = Usual { mean: 0.002, deviation: 0.003, range: -0.002..=0.010 };
         match self {

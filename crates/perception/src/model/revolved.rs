@@ -1,4 +1,4 @@
-//! Walls of even thickness, turned about an axis: a polyline of (radius, height) is the middle of the wall.
+//! Walls of even thickness revolved about an axis: a polyline of (radius, height) is the middle of the wall.
 
 use super::Round;
 use super::form::{BELLY, Form, LIFT};
@@ -6,16 +6,16 @@ use super::form::{BELLY, Form, LIFT};
 /// A point of the half plane: distance from the axis and height above the table, in metres.
 pub(super) type Point = [f64; 2];
 
-/// How thick the walls are, in metres.
+/// Thickness of the walls, in metres.
 const WALL: f64 = 0.004;
 
-/// How wide the rim around a can's lid is, in metres.
+/// Width of the rim around a can's lid, in metres.
 const RIM: f64 = 0.003;
 
-/// How high the seam is that stands out from a can's side at its top, in metres.
+/// Height of the seam that protrudes from a can's side at its top, in metres.
 const SEAM: f64 = 0.004;
 
-/// What is round: its greatest radius, its height, and its form (see [`super::form`]).
+/// A round object: its greatest radius, its height, and its form (see [`super::form`]).
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Turned {
     pub(super) kind: Round,
@@ -24,8 +24,8 @@ pub(super) struct Turned {
     pub(super) form: Form,
 }
 
-/// The middle of the wall from the axis to the rim, as parts of what is left of radius and height beside the wall itself; and how much
-/// of its form's belly each place moves out.
+/// The middle of the wall from the axis to the rim, as parts of the radius and the height that remain without the wall itself; and the part of
+/// the form's belly by which each point moves outwards.
 fn shape(kind: Round) -> &'static [[f64; 3]] {
     match kind {
         Round::Can => &[],
@@ -43,17 +43,17 @@ fn wall(of: &Turned) -> impl Iterator<Item = Point> + Clone + use<> {
     shape(of.kind).iter().map(move |[r, z, out]| [(r * across + out * belly).min(across), bottom + z * rise])
 }
 
-/// How much the topmost part of the wall leans outwards, in radians from upright; none for what is closed.
+/// How much the topmost part of the wall leans outwards, in radians from upright; `None` for closed objects.
 pub(super) fn rim_lean(of: &Turned) -> Option<f64> {
     let (below, rim) = pairs(wall(of)).last()?;
     Some((rim[0] - below[0]).atan2(rim[1] - below[1]))
 }
 
-/// How edge-on a wall has to be seen for both of its sides to be taken for seen: the cosine between its normal and the ray.
+/// Both sides of a wall count as seen when it is this close to edge-on: the cosine between its normal and the ray.
 const EDGE_ON: f64 = 0.15;
 
-/// Signed distance from the side of the wall that looks to the eye: a point that noise has put behind a wall of 4 mm still
-/// belongs to the side that was seen. `to_eye` is the way from the point to the eye, outwards and up.
+/// Signed distance from the side of the wall that faces the eye: a point that noise has put behind a wall of 4 mm still belongs to the side
+/// that was seen. `to_eye` is the vector from the point to the eye, outwards and up.
 pub(super) fn distance(of: &Turned, point: Point, to_eye: Point) -> f64 {
     if of.kind == Round::Can {
         return can_distance(of, point, to_eye);
@@ -66,7 +66,7 @@ pub(super) fn distance(of: &Turned, point: Point, to_eye: Point) -> f64 {
     let outwards = normal(a, b);
     let facing = outwards[0] * to_eye[0] + outwards[1] * to_eye[1];
     let off = outwards[0] * (point[0] - a[0]) + outwards[1] * (point[1] - a[1]);
-    // All around the rim the wall is seen.
+    // The rim is seen from all sides.
     let along = [b[0] - a[0], b[1] - a[1]];
     let past = (point[0] - b[0]) * along[0] + (point[1] - b[1]) * along[1];
     let at_rim = b[1] >= of.height - WALL && past > -half * along[0].hypot(along[1]);
@@ -80,7 +80,7 @@ fn from_wall(of: &Turned, point: Point) -> f64 {
     squares.fold(f64::INFINITY, f64::min).sqrt() - WALL / 2.0
 }
 
-/// Signed distance from the thing filled to its rim.
+/// Signed distance from the object filled to its rim.
 pub(super) fn fill_distance(of: &Turned, point: Point) -> f64 {
     let (radius, height) = (of.radius, of.height);
     if of.kind == Round::Can {
@@ -93,14 +93,14 @@ pub(super) fn fill_distance(of: &Turned, point: Point) -> f64 {
     if z < 0.0 || z > height {
         return to_wall.min(if z > height && r < radius { z - height } else { f64::INFINITY });
     }
-    // Within the hollow the wall is crossed outwards: negative is how deep below rim and outer side.
+    // Inside the hollow the distance is negative: the smaller of the depth below the rim and below the outer side.
     let inside = pairs(wall(of))
         .find(|(a, b)| b[1] > a[1] && (a[1]..=b[1]).contains(&z))
         .is_some_and(|(a, b)| r < a[0] + (b[0] - a[0]) * (z - a[1]) / (b[1] - a[1]));
     if inside { -(to_wall.max(0.0) + WALL).min(height - z) } else { to_wall }
 }
 
-/// The outline of the material: from the axis below, around the rim, back to the axis above. Corners are mitred.
+/// The outline of the material: from the axis at the bottom, around the rim, back to the axis above. Corners are mitred.
 pub(super) fn outline(of: &Turned) -> Vec<Point> {
     let (radius, height) = (of.radius, of.height);
     if of.kind == Round::Can {
@@ -120,7 +120,7 @@ pub(super) fn outline(of: &Turned) -> Vec<Point> {
             .collect()
     };
     let mut outline = side(1.0);
-    // The rim ends half a wall beyond the wall's middle.
+    // The rim ends half a wall beyond the middle line's end.
     if let [.., before, last] = middle[..] {
         let beyond = normal(before, last);
         outline.push([last[0] - beyond[1] * WALL / 2.0, last[1] + beyond[0] * WALL / 2.0]);
@@ -129,18 +129,18 @@ pub(super) fn outline(of: &Turned) -> Vec<Point> {
     outline
 }
 
-/// The unit normal to the right of the way from `a` to `b`: outwards.
+/// The unit normal to the right of the direction from `a` to `b`: outwards.
 fn normal(a: Point, b: Point) -> Point {
     let length = (b[0] - a[0]).hypot(b[1] - a[1]);
     [(b[1] - a[1]) / length, (a[0] - b[0]) / length]
 }
 
-/// Signed distance from the lid or the near side of a can, for a point that noise has moved along its ray: the far side is not seen, so what is
-/// behind it comes from the lid, and what is in front of the near edge comes from the one of both that its ray meets.
+/// Signed distance from the lid or the near side of a can, for a point that noise has moved along its ray. The far side is not seen, so points
+/// behind it belong to the lid; points in front of the near edge belong to the one of the two that their ray meets.
 fn can_distance(of: &Turned, [r, z]: Point, to_eye: Point) -> f64 {
     let lid = if r < of.radius - RIM { of.height + of.form[LIFT] } else { of.height };
     let above = z - lid;
-    // Where the ray comes through the lid.
+    // The point at which the ray passes through the lid's plane.
     let through = r - to_eye[0] * above / to_eye[1].max(1e-9);
     let hidden = above < 0.0 && to_eye[0] < -EDGE_ON * to_eye[0].hypot(to_eye[1]);
     if (hidden || above > 0.0) && through < of.radius {

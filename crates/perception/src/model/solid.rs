@@ -6,7 +6,7 @@ use parry3d::math::Vector;
 use parry3d::shape::SharedShape;
 use std::f64::consts::TAU;
 
-/// Corners of what is round: at 15 cm of radius a chord is 0.1 mm within the circle.
+/// Number of corners around the axis: at 15 cm of radius a chord is 0.1 mm within the circle.
 const CORNERS: u32 = 80;
 
 impl Model {
@@ -26,7 +26,7 @@ impl Model {
     }
 }
 
-/// An outline turned about the axis, lowered by `down`.
+/// An outline revolved about the axis, lowered by `down`.
 fn turned(outline: &[[f64; 2]], down: f64) -> SharedShape {
     let rows = outline.len() as u32;
     let mut vertices = Vec::with_capacity(outline.len() * CORNERS as usize);
@@ -40,7 +40,7 @@ fn turned(outline: &[[f64; 2]], down: f64) -> SharedShape {
         let next = (corner + 1) % CORNERS;
         for row in 0..rows - 1 {
             let [a, b, c, d] = [corner * rows + row, corner * rows + row + 1, next * rows + row + 1, next * rows + row];
-            // On the axis a side of the quad is a point.
+            // On the axis one side of the quad is a point.
             if outline[row as usize][0] > 0.0 {
                 triangles.push([a, b, d]);
             }
@@ -60,7 +60,7 @@ fn mesh(vertices: Vec<Vector>, triangles: Vec<[u32; 3]>) -> SharedShape {
     SharedShape::trimesh(vertices, triangles).expect("a solid has triangles")
 }
 
-/// The sides of a block whose corners are numbered by bits: 4 is ahead, 2 to the left, 1 above.
+/// The faces of a block whose corners are numbered by bits: 4 is ahead, 2 to the left, 1 above.
 const BLOCK: [[u32; 4]; 6] = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]];
 
 /// The fork: a block for each part of the strip, and one for each tine.
@@ -71,7 +71,7 @@ fn strip(length: f64) -> SharedShape {
         let ends = [part, part + 1].map(|node| (fork::NODES[node], across(node)));
         let tines = if part + 2 == fork::NODES.len() { fork::TINES } else { 1 };
         for tine in 0..tines {
-            // From -1 to 1 over the width.
+            // From -1 to 1 across the width.
             let span = |side: f64| {
                 if tines == 1 {
                     return side;
@@ -99,7 +99,8 @@ fn strip(length: f64) -> SharedShape {
     mesh(vertices, triangles)
 }
 
-/// From the strip's middle to its upper side at a node, along x and z: where the sides of the parts beside it meet.
+/// The vector from the strip's middle to its upper side at a node, along x and z: where the sides of the adjacent
+/// parts meet.
 fn across(node: usize) -> [f64; 2] {
     let normal = |pair: &[fork::Node]| {
         let (dx, dz) = (pair[1].x - pair[0].x, pair[1].z - pair[0].z);

@@ -1,6 +1,6 @@
-//! Random numbers without a state: hashes, uniform and normal samples of them, and smooth normal fields.
+//! Stateless random numbers: hashes, uniform and normal samples from them, and smooth normal fields.
 
-/// The finaliser of SplitMix64 (Steele, Lea, Flood 2014): every input bit reaches every output bit.
+/// The finaliser of SplitMix64 (Steele, Lea, Flood 2014): every input bit affects every output bit.
 pub(crate) fn hash(x: u64) -> u64 {
     let x = x.wrapping_add(0x9E37_79B9_7F4A_7C15);
     let x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -8,7 +8,7 @@ pub(crate) fn hash(x: u64) -> u64 {
     x ^ (x >> 31)
 }
 
-/// From 0 to 1, without 1.
+/// Uniform in [0, 1).
 pub(crate) fn uniform(bits: u64) -> f64 {
     (bits >> 11) as f64 / (1_u64 << 53) as f64
 }
@@ -43,7 +43,7 @@ pub(crate) fn in_space(at: [f64; 3]) -> f64 {
 pub(crate) fn along_row(seed: u64, start: f64, step: f64, count: usize, y: f64) -> Vec<f64> {
     let (below, up) = (y.floor(), smooth(y - y.floor()));
     let knot = |column: i64, row: f64| normal(hash(hash(seed ^ column as u64) ^ row as i64 as u64));
-    // The two rows of knots around this one, blended once a column of knots.
+    // The two rows of knots around this row, blended once per column of knots.
     let blended = |column: i64| (1.0 - up) * knot(column, below) + up * knot(column, below + 1.0);
     let spread = ((1.0 - up).powi(2) + up.powi(2)).sqrt();
     let mut at = start.floor() as i64;
@@ -61,17 +61,17 @@ pub(crate) fn along_row(seed: u64, start: f64, step: f64, count: usize, y: f64) 
         .collect()
 }
 
-/// How much of a standard normal distribution is below a value (to 2 %: a logistic distribution's).
+/// The cumulative standard normal distribution (to 2 %: approximated by a logistic distribution).
 pub(crate) fn share_below(value: f64) -> f64 {
     1.0 / (1.0 + (-1.702 * value).exp())
 }
 
-/// From 0 to 1 without a corner at either end.
+/// From 0 to 1 with zero slope at both ends.
 fn smooth(part: f64) -> f64 {
     part * part * (3.0 - 2.0 * part)
 }
 
-/// Close to a standard normal where tails do not matter: twice the centred sum of three uniforms.
+/// About standard normal where tails do not matter: twice the centred sum of three uniforms.
 fn cheap_normal(bits: u64) -> f64 {
     let [a, b, c] = [bits, bits >> 21, bits >> 42].map(|b| (b & 0x1F_FFFF) as f64 / f64::from(0x20_0000));
     2.0 * (a + b + c - 1.5)
@@ -109,7 +109,7 @@ mod tests {
         let row = along_row(7, -3.3, 0.1, 500, 2.5);
         let step = row.windows(2).map(|pair| (pair[0] - pair[1]).powi(2)).sum::<f64>() / 499.0;
         assert!(step < 0.1, "{step}");
-        // Three lengths apart nothing is alike, in the mean over many rows.
+        // Values three lengths apart are uncorrelated, averaged over many rows.
         let product = |seed| {
             let row = along_row(hash(seed), 0.3, 3.0, 2, 2.5);
             row[0] * row[1]

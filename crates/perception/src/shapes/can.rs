@@ -1,10 +1,11 @@
-//! A tin can: seams above and below stand out from the body, lid and bottom are sunken.
+//! A tin can: the seams at the top and the bottom protrude from the body, the lid and the bottom
+//! are sunken.
 
 use super::lathe::turned;
 use super::mesh::Mesh;
 use rand::{Rng, RngExt};
 
-/// A can whose seams have this radius.
+/// A can with this radius at its seams.
 pub(super) fn tin(radius: f64, height: f64, random: &mut impl Rng) -> Mesh {
     let (sunken, waist) = (random.random_range(0.002..0.005), radius - random.random_range(0.0008..0.002));
     let (inner, seam) = (radius - 0.003, 0.0035);

@@ -3,11 +3,11 @@
 use super::mesh::Mesh;
 use rand::{Rng, RngExt};
 
-/// A box of this size: each edge and each corner is cut off.
+/// A box of this size with all edges and corners cut off.
 pub(super) fn bevelled(size: [f64; 3], random: &mut impl Rng) -> Mesh {
     let bevel = random.random_range(0.002..0.005);
     let mut mesh = Mesh::default();
-    // At every corner a point on each of the three faces that meet there.
+    // For every corner a point on each of the three faces that meet there.
     let corners: Vec<[u32; 3]> = (0..8_u32)
         .map(|corner| {
             let side = |axis: usize| if corner >> axis & 1 == 1 { 1.0 } else { -1.0 };

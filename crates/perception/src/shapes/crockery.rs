@@ -1,14 +1,14 @@
-//! Bowls and plates: thrown on a wheel, on a ring for a foot, each with a curve of its own.
+//! Bowls and plates: revolved shapes on a ring-shaped foot, each with its own curve.
 
 use super::lathe::{Point, lip, turned};
 use super::mesh::Mesh;
 use rand::{Rng, RngExt};
 use std::f64::consts::FRAC_PI_2;
 
-/// Parts of a curve.
+/// Number of segments of a curve.
 const CURVE: i32 = 12;
 
-/// A bowl of this radius at the rim: from a foot up along a superellipse, in some of them flared below the lip.
+/// A bowl with this radius at the rim: from a foot up along a superellipse, some flared below the lip.
 pub(super) fn bowl(radius: f64, height: f64, random: &mut impl Rng) -> Mesh {
     let foot = radius * random.random_range(0.40..0.55);
     let (ring, wall) = (random.random_range(0.002..0.005), random.random_range(0.003..0.006));
@@ -23,7 +23,7 @@ pub(super) fn bowl(radius: f64, height: f64, random: &mut impl Rng) -> Mesh {
     shell(foot, outer, wall, [radius, height])
 }
 
-/// A plate of this radius: a flat well on a ring, a shoulder, and a rim that rises to the edge.
+/// A plate with this radius: a flat well on a ring, a shoulder, and a rim that rises to the edge.
 pub(super) fn plate(radius: f64, height: f64, random: &mut impl Rng) -> Mesh {
     let (well, shoulder) = (random.random_range(0.52..0.66), random.random_range(0.06..0.14));
     let (ring, wall) = (random.random_range(0.0015..0.003), random.random_range(0.003..0.0045));
@@ -31,7 +31,7 @@ pub(super) fn plate(radius: f64, height: f64, random: &mut impl Rng) -> Mesh {
     let outer = |part: f64| -> Point {
         let across = well + (1.0 - well) * part;
         let bend = ((across - well) / shoulder).min(1.0);
-        // Smooth up the shoulder, then straight.
+        // Smooth at the shoulder, then straight.
         let beyond = ((across - well - shoulder) / (1.0 - well - shoulder)).max(0.0);
         let up = rise * bend * bend * (3.0 - 2.0 * bend) + (1.0 - rise) * beyond;
         [radius * across, ring + (height - wall / 2.0 - ring) * up]
@@ -46,7 +46,7 @@ fn shell(foot: f64, outer: impl Fn(f64) -> Point, wall: f64, rim: Point) -> Mesh
     let mut outline: Vec<Point> = vec![[0.0, bottom], [foot - 0.006, bottom], [foot - 0.005, 0.0], [foot - 0.001, 0.0]];
     outline.extend(&curve);
     outline.extend(lip(rim, wall));
-    // The inner side is a wall's thickness within the outer one.
+    // The inner side is offset from the outer one by the wall's thickness.
     let inner = (0..curve.len()).rev().map(|i| {
         let (before, after) = (curve[i.saturating_sub(1)], curve[(i + 1).min(curve.len() - 1)]);
         let (dr, dz) = (after[0] - before[0], after[1] - before[1]);

@@ -3,15 +3,16 @@
 use super::mesh::Mesh;
 use rand::{Rng, RngExt};
 
-/// Parts of the handle and head, of each tine, and of a cross section.
+/// Numbers of segments: along the handle and head, along each tine, and around a cross section.
 const LENGTHWISE: i32 = 28;
 const TINE: i32 = 8;
 
-/// A fork that fills a box of this size, its tips ahead along x.
+/// A fork that fills a box of this size, with the tips in the direction of x.
 pub(super) fn fork(size: [f64; 3], random: &mut impl Rng) -> Mesh {
     let [length, width, height] = size;
     let mut within = |low: f64, high: f64| random.random_range(low..high);
-    // Along the fork, from 0 at the handle's end to 1 at the tips: about where the neck is, where it touches the table, where tines begin.
+    // Positions along the fork, from 0 at the handle's end to 1 at the tips: the neck, the point that touches the table, the roots of the
+    // tines.
     let (neck, bow, root) = (within(0.60, 0.67), within(0.83, 0.88), within(0.76, 0.80));
     let (tips, narrow, end) = (within(0.55, 0.85), within(0.25, 0.38), within(0.65, 0.95));
     let thick = within(0.0018, 0.0032);
@@ -50,7 +51,7 @@ pub(super) fn fork(size: [f64; 3], random: &mut impl Rng) -> Mesh {
     };
     strip(&mut mesh, LENGTHWISE, [0.0, root], &|at| [-half(at), half(at), thick]);
     for tine in 0..tines {
-        // Each tine keeps its place in the head's width and thins towards its tip.
+        // Each tine keeps its place in the head's width and gets thinner towards its tip.
         let pitch = 2.0 / (f64::from(tines) - 1.0 + metal);
         strip(&mut mesh, TINE, [root, 1.0], &|at| {
             let thin = 1.0 - 0.45 * ((at - root) / (1.0 - root)).powi(2);
@@ -62,7 +63,7 @@ pub(super) fn fork(size: [f64; 3], random: &mut impl Rng) -> Mesh {
     mesh.fitted(size)
 }
 
-/// A smooth curve through nodes (x, y) with x increasing: cubic Hermite, with the slopes of Catmull and Rom. Its extremes are near nodes.
+/// A smooth curve through nodes (x, y) with x increasing: cubic Hermite with Catmull-Rom slopes. Its extremes are near nodes.
 fn curve(nodes: &[(f64, f64)], x: f64) -> f64 {
     let last = nodes.len() - 1;
     let slope = |i: usize| {

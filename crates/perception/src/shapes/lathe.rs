@@ -1,4 +1,4 @@
-//! What a lathe or a potter's wheel makes: an outline turned about the upright axis.
+//! Shapes of a lathe or a potter's wheel: an outline revolved about the upright axis.
 
 use super::mesh::Mesh;
 use std::f64::consts::TAU;
@@ -6,11 +6,11 @@ use std::f64::consts::TAU;
 /// Distance from the axis and height above the table, in metres.
 pub(super) type Point = [f64; 2];
 
-/// Corners around the axis: at 13 cm of radius a chord is 0.1 mm within the circle.
+/// Number of corners around the axis: at 13 cm of radius a chord is 0.1 mm within the circle.
 const AROUND: u32 = 72;
 
-/// The outline from the axis below around the rim to the axis above, turned, with the middle of its height at 0. Places on the axis
-/// are a hair's breadth beside it, so that every ring has an extent.
+/// Revolves the outline, from the axis at the bottom around the rim to the axis above, with the middle of its height at 0. Points
+/// on the axis are moved slightly away from it, so that every ring has an extent.
 pub(super) fn turned(outline: &[Point], height: f64) -> Mesh {
     let mut mesh = Mesh::default();
     let rings: Vec<Vec<u32>> = outline
@@ -29,7 +29,7 @@ pub(super) fn turned(outline: &[Point], height: f64) -> Mesh {
     mesh
 }
 
-/// A lip of so many metres thickness that ends at `top`: half a circle from the outer side to the inner one.
+/// A lip of this thickness in metres that ends at `top`: a half circle from the outer side to the inner one.
 pub(super) fn lip(top: Point, thickness: f64) -> impl Iterator<Item = Point> {
     let half = thickness / 2.0;
     (1..6).map(move |i| {

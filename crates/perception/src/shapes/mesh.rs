@@ -11,7 +11,7 @@ pub(super) struct Mesh {
 }
 
 impl Mesh {
-    /// Adds a point and gives its number.
+    /// Adds a point and returns its index.
     pub(super) fn point(&mut self, point: [f64; 3]) -> u32 {
         self.points.push(point);
         self.points.len() as u32 - 1
@@ -21,12 +21,12 @@ impl Mesh {
         self.triangles.push(corners);
     }
 
-    /// A side with four corners, in order around it.
+    /// Adds a face with four corners, in order around it.
     pub(super) fn quad(&mut self, [a, b, c, d]: [u32; 4]) {
         self.triangles.extend([[a, b, c], [a, c, d]]);
     }
 
-    /// The skin over rings of the same number of points, from one ring to the next, each ring closed.
+    /// Adds the skin over rings with the same number of points, from one ring to the next, each ring closed.
     pub(super) fn skin(&mut self, rings: &[Vec<u32>]) {
         for (near, far) in rings.iter().zip(rings.iter().skip(1)) {
             for i in 0..near.len() {
@@ -36,14 +36,14 @@ impl Mesh {
         }
     }
 
-    /// A flat end over a convex ring.
+    /// Adds a flat end over a convex ring.
     pub(super) fn cap(&mut self, ring: &[u32]) {
         for i in 1..ring.len().saturating_sub(1) {
             self.triangle([ring[0], ring[i], ring[i + 1]]);
         }
     }
 
-    /// Everything stretched along each axis, and shifted, so that its bounding box is of this size and in the middle.
+    /// Scales and shifts everything along each axis, so that the bounding box has this size and is centred.
     pub(super) fn fitted(mut self, size: [f64; 3]) -> Mesh {
         for (axis, edge) in size.into_iter().enumerate() {
             let along = self.points.iter().map(|p| p[axis]);
@@ -56,7 +56,7 @@ impl Mesh {
         self
     }
 
-    /// As a shape that rays can be cast at.
+    /// The mesh as a shape for ray casting.
     #[expect(clippy::expect_used, reason = "every kind of mesh is made by a test, and all have triangles")]
     pub(super) fn shape(self) -> SharedShape {
         let points = self.points.into_iter().map(|p| Vector::from_array(p.map(|c| c as f32))).collect();

@@ -1,19 +1,20 @@
-//! A cup: a tapering wall with a rounded lip on a ring, most often with a handle.
+//! A cup: a tapering wall with a rounded lip on a ring, usually with a handle.
 
 use super::lathe::{Point, lip, turned};
 use super::mesh::Mesh;
 use rand::{Rng, RngExt};
 use std::f64::consts::{PI, TAU};
 
-/// Parts of the wall's height, and of the handle's bow and its cross section.
+/// Numbers of segments: along the wall's height, along the handle's bow, and around its cross
+/// section.
 const RISE: i32 = 8;
 const BOW: i32 = 12;
 const AROUND: i32 = 8;
 
-/// A cup of this radius at the rim.
+/// A cup with this radius at the rim.
 pub(super) fn mug(radius: f64, height: f64, has_handle: bool, random: &mut impl Rng) -> Mesh {
     let foot = radius * if has_handle { random.random_range(0.72..0.96) } else { random.random_range(0.84..0.95) };
-    // How far the wall bulges in the middle of its height.
+    // How far the wall bulges at half its height.
     let bulge = random.random_range(0.0..0.025) * radius;
     let wall = random.random_range(0.003..0.005);
     let side = |part: f64| foot + (radius - foot) * part + bulge * (PI * part).sin();
@@ -35,7 +36,7 @@ pub(super) fn mug(radius: f64, height: f64, has_handle: bool, random: &mut impl 
         let thick = random.random_range(0.003..0.005);
         let turn = random.random_range(0.0..TAU);
         let way = |bow: f64| -> Point {
-            // From the upper end to the lower one; both ends are within the wall.
+            // From the upper end to the lower one; both ends are inside the wall.
             let part = (high + low) / 2.0 + (high - low) / 2.0 * (PI * bow).cos();
             [side(part) - wall / 2.0 + reach * (PI * bow).sin().powf(0.8), part * height]
         };
@@ -44,7 +45,7 @@ pub(super) fn mug(radius: f64, height: f64, has_handle: bool, random: &mut impl 
     mesh
 }
 
-/// A tube with an oval cross section along a way in an upright plane, turned about the axis.
+/// A tube with an oval cross section along a path in an upright plane, turned about the axis.
 fn handle(mesh: &mut Mesh, way: impl Fn(f64) -> Point, thick: f64, turn: f64, height: f64) {
     let (sin, cos) = turn.sin_cos();
     let rings: Vec<Vec<u32>> = (0..=BOW)
