@@ -1,8 +1,7 @@
-//! Motions of the base: planned from where it stands to a place with a tolerance, timed within its limits, and checked before they
-//! are followed.
+//! Motions of the base: planned from its present place to a goal with a tolerance, timed within its limits, and checked before they are executed.
 //!
-//! The path is that of `drive`, its corners are rounded and it is timed like the arm's (`timing`), in x, y and heading. What
-//! stands on the deck, and what is held, rides along. What a camera saw is kept away from, but for the floor. Headings of a trajectory go on beyond half a turn; those of a place do not.
+//! The path comes from `drive`; its corners are rounded and it is timed like the arm's (`timing`), in x, y and heading. Objects that stand on the deck or are
+//! held move with the base. The path avoids what a camera saw, except the floor. Headings of a trajectory may exceed half a turn; those of a place do not.
 
 use crate::cloud::{CloudError, MAX_RADIUS_M};
 use crate::collision::length;
@@ -27,106 +26,106 @@ use ratn_model::value::Trajectory;
 use ratn_world::scene::{Placement, Scene};
 use std::f64::consts::TAU;
 
-/// Room that a planned way keeps, in metres.
+/// Clearance of a planned path, in metres.
 const PADDING_M: f64 = 0.02;
 
-/// How far from the base's place a trajectory may start, in metres and in radians.
+/// Maximum distance of a trajectory's start from the base's place, in metres and in radians.
 pub const START_TOLERANCE: f64 = 0.02;
 
-/// Something stands on the deck that is at most this much above it, or in it, in metres.
+/// An object stands on the deck if its lowest point is within this distance of the deck, in metres.
 const STANDS_M: f64 = 0.03;
 
-/// The loosest tolerances, in metres and in radians.
+/// Maximum tolerances, in metres and in radians.
 const MAX_TOLERANCE: f64 = 1.0;
 
-/// Places tried within the tolerance of goals that are not free.
+/// Number of places tried within the tolerance of goals that are not free.
 const PLACES: usize = 64;
 
-/// The most alternatives of one goal.
+/// Maximum number of alternative goals.
 const MAX_GOALS: usize = 64;
 
-/// Samples of the search.
+/// Number of samples of the search.
 const ITERATIONS: usize = 30_000;
 
-/// Room that a place is checked with roughly, and what may go unseen exactly, in metres.
+/// Clearance of the rough check of a place, and resolution of the exact check, in metres.
 const ROOMY_M: f64 = 0.01;
 const RESOLUTION_M: f64 = 1e-3;
 
-/// Where to drive.
+/// A request for a drive.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DriveRequest {
-    /// The whole robot at the start. The base drives from there; everything else stays as it is all along.
+    /// The state of the whole robot at the start. The base drives from there; everything else stays as it is.
     pub start: Configuration,
-    /// Alternatives, any one will do: x, y and heading.
+    /// Alternative goals, any one will do: x, y and heading.
     pub goals: Vec<[f64; 3]>,
-    /// A goal that is not free may be missed by so much, in metres.
+    /// Allowed deviation from a goal that is not free, in metres.
     pub position_tolerance_m: f64,
-    /// … and by so much, in radians.
+    /// … and in radians.
     pub heading_tolerance_rad: f64,
     /// Fraction of the base's velocity and acceleration limits.
     pub speed: f64,
-    /// What a depth camera saw beside the scene, as long as the base stands where the scene has it. Points so near to the floor that they may be
-    /// of it are left out, as those at other known things are.
+    /// What a depth camera saw in addition to the scene, valid while the base stands where the scene has it. Points so near to the floor that they may belong
+    /// to it are left out, as are points near other known objects.
     pub seen: Option<Seen>,
     /// The same request, scene and seed give the same plan.
     pub seed: u64,
 }
 
-/// A drive.
+/// A planned drive.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DrivePlan {
-    /// Timed.
+    /// The timed trajectory.
     pub trajectory: Trajectory,
-    /// Where it ends: x, y and heading within half a turn.
+    /// Its end: x, y and heading within half a turn.
     pub end: [f64; 3],
-    /// Of the path, in metres and radians alike.
+    /// The length of the path; metres and radians are added up.
     pub length: f64,
 }
 
-/// Why there is no way.
+/// Why there is no path.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum DriveError {
     /// A part of the request is out of range or contradicts the robot.
     #[error("{what} is {value}: expected {expected}")]
     Malformed {
-        /// Which part of it.
+        /// The part.
         what: String,
-        /// What it is.
+        /// Its value.
         value: String,
-        /// What it should be.
+        /// The allowed values.
         expected: String,
     },
-    /// What was seen is no obstacle that can be kept away from.
+    /// What was seen cannot be used as an obstacle.
     #[error("what was seen: {error}")]
     Seen {
-        /// Why.
+        /// The reason.
         error: CloudError,
     },
-    /// It has no base that drives.
+    /// The robot has no base that drives.
     #[error("{robot} has no base that drives: its description has no `[base]`")]
     NoBase {
-        /// Its name.
+        /// The robot's name.
         robot: String,
     },
-    /// It touches something where it stands.
+    /// The robot touches something at the start.
     #[error("the robot cannot drive off: there is less than {:.0} mm between it and something else{}", PADDING_M * 1e3, touching(.touch.as_ref()))]
     Start {
-        /// What, where it touches it.
+        /// The contact, where there is one.
         touch: Option<Touch>,
     },
-    /// It would touch something at every goal.
+    /// The robot would touch something at every goal.
     #[error(
         "none of the {goals} goals is free, nor any place tried within {position_m:.2} m and {heading_rad:.2} rad of them"
     )]
     Goal {
-        /// How many there are.
+        /// Number of goals.
         goals: usize,
         /// The tolerance, in metres.
         position_m: f64,
         /// The tolerance, in radians.
         heading_rad: f64,
     },
-    /// Nothing was found.
+    /// The search found no path.
     #[error(transparent)]
     NoPath(ConnectError),
     /// The caller cancelled the planning.
@@ -137,31 +136,31 @@ pub enum DriveError {
 /// Why the base may not follow a trajectory.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum DriveViolation {
-    /// It is none of the base.
+    /// It is not a trajectory of the base.
     #[error(transparent)]
     Malformed(#[from] TrajectoryError),
-    /// It starts elsewhere.
+    /// It starts at another place.
     #[error("the base is {metres:.3} m and {radians:.3} rad away from where the trajectory starts")]
     Start {
-        /// How far.
+        /// The distance.
         metres: f64,
-        /// How much turned.
+        /// The difference of headings.
         radians: f64,
     },
     /// It breaks a limit, or does not start and end at rest.
     #[error(transparent)]
     Limit(#[from] Violation),
-    /// Something is in the way.
+    /// It would touch something.
     #[error("at {time_s:.2} s {touch}")]
     Touch {
-        /// When.
+        /// The time.
         time_s: f64,
-        /// What touches what.
+        /// The contact.
         touch: Touch,
     },
 }
 
-/// What stands on the robot's deck: objects whose middle is above it and whose lowest point is at its height.
+/// Objects on the robot's deck: their centre is above the deck and their lowest point at its height.
 pub fn riding(robot: &Robot, scene: &Scene) -> Vec<String> {
     let standing = robot.at_zero().with_base(&scene.base);
     let Some(base) = robot.body() else { return Vec::new() };
@@ -181,10 +180,10 @@ pub fn riding(robot: &Robot, scene: &Scene) -> Vec<String> {
     on_deck.map(|object| object.name.clone()).collect()
 }
 
-/// A way for the base in a scene, whose base says where what rides along is seen from.
+/// Plans a path for the base in a scene. The scene's base is where objects that move with it were seen from.
 ///
 /// # Errors
-/// [`DriveError`] says why there is none.
+/// [`DriveError`] says why there is no path.
 pub fn plan_drive(
     robot: &Robot,
     scene: &Scene,
@@ -231,8 +230,8 @@ pub fn plan_drive(
     Ok(DrivePlan { trajectory: trajectory.named(&joints), end: [end[0], end[1], wrapped(end[2])], length })
 }
 
-/// Checks a trajectory for a base that stands where the scene says, with the arm as in `configuration` and `riding` on its deck.
-/// Gives it back ready to be sampled.
+/// Checks a trajectory for a base that stands where the scene says, with the arm as in `configuration` and `riding` on its deck. Returns it ready to be
+/// sampled.
 ///
 /// # Errors
 /// The first [`DriveViolation`].
@@ -259,8 +258,8 @@ pub fn check_drive(
     Ok(trajectory)
 }
 
-/// Looks at the middle of a piece of the curve: with room for as far as anything moves from there within the piece, roughly; else
-/// exactly, in pieces that get shorter until nothing moves by more than [`RESOLUTION_M`].
+/// Checks the middle of a piece of the curve: roughly, with clearance for all movement within the piece; where that fails, exactly, in ever shorter pieces
+/// until nothing moves by more than [`RESOLUTION_M`].
 fn check_way(
     [vehicle, roomy]: [&Vehicle; 2],
     obstacles: &[Obstacle],
@@ -279,7 +278,7 @@ fn check_way(
     look(0.0, &knots[0].positions)?;
     for (i, pair) in knots.windows(2).enumerate() {
         let cubics = trajectory.cubics(i);
-        // In order of time: the last is taken first.
+        // In order of time: the last piece is taken first.
         let mut pieces = vec![[0.0, pair[1].time_s - pair[0].time_s]];
         while let Some([from, to]) = pieces.pop() {
             let middle = (from + to) / 2.0;
@@ -304,7 +303,7 @@ fn check_way(
     look(end.time_s, &end.positions)
 }
 
-/// The base's joints within the area that it drives in; a heading that turns on and on goes as far as a trajectory does.
+/// The base's joints within its drive area; a heading without limits gets the range of a trajectory.
 fn limits(robot: &Robot) -> Vec<Joint> {
     let mut joints = robot.base_joints().to_vec();
     if let (Some((_, None)), Some(heading)) = (robot.drive_area(), joints.last_mut()) {
@@ -348,7 +347,7 @@ impl DriveRequest {
         }
     }
 
-    /// Places within the tolerance of the goals.
+    /// Random places within the tolerance of the goals.
     fn around(&self) -> Vec<[f64; 3]> {
         let mut random = ChaCha8Rng::seed_from_u64(self.seed);
         let place = |i: usize| {

@@ -1,14 +1,14 @@
-//! The closed parts of a mesh: what hangs together by common edges and has an even number of triangles at each of them.
+//! The closed parts of a mesh: triangles that are connected by common edges, with an even number of triangles at each edge.
 //!
-//! A triangle that is there several times, from one side or from both, counts once. Where it is there an even number of times it may also be a
-//! wall within a part, or between two that touch: then the part is closed without it. What is neither closed with these triangles nor without
-//! them has no inside and is left out.
+//! A triangle that occurs several times, from one side or from both, counts once. If it occurs an even number of times, it may also be a wall
+//! within a part, or between two parts that touch: then the part is closed without it. A part that is closed neither with these triangles nor
+//! without them has no inside and is left out.
 //!
-//! Bodies may touch along edges, where more than two triangles meet. What hangs together by other edges and is closed by itself is a part of
-//! its own, so that what is wrong with one body, or turned otherwise, is nothing to the body beside it.
+//! Bodies may touch along edges, where more than two triangles meet. Triangles that are connected by other edges and are closed by themselves
+//! form a separate part, so that an error in one body, or another orientation, does not affect the body beside it.
 //!
-//! Each part is turned consistently where it can be, so that what it holds can be told by its winding number, also where it crosses itself; else
-//! only the parity of crossings tells.
+//! Each part is oriented consistently where that is possible, so that the winding number tells its inside, also where the part intersects
+//! itself; otherwise only the parity of crossings tells.
 
 use crate::mesh::Mesh;
 use std::collections::{BTreeMap, VecDeque};
@@ -20,22 +20,22 @@ type Indices = [u32; 3];
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct ClosedPart {
     pub(crate) triangles: Vec<[Corner; 3]>,
-    /// Whether all edges are walked as often in one direction as in the other.
+    /// Whether every edge is used equally often in both directions.
     pub(crate) is_oriented: bool,
-    /// 1 where its triangles are seen from outside to turn to the left, -1 to the right, 0 where the file does not say.
+    /// Orientation of its triangles as seen from outside: 1 counter-clockwise, -1 clockwise, 0 where the file does not tell.
     pub(crate) sense: i32,
 }
 
-/// A triangle that is there once or more often.
+/// A triangle, which may occur several times.
 #[derive(Debug, Clone, Copy)]
 struct Face {
     corners: Indices,
     is_odd: bool,
-    /// Whether it is there more often from one side than from the other.
+    /// Whether it occurs more often from one side than from the other.
     has_side: bool,
 }
 
-/// The closed parts of a mesh, and a corner of each part that hangs together by common corners, closed or not.
+/// The closed parts of a mesh, and a corner of each part that is connected by common corners, closed or not.
 pub(crate) fn closed_parts(mesh: &Mesh) -> (Vec<ClosedPart>, Vec<Corner>) {
     let (corners, indices) = numbered(mesh);
     let faces = faces(&indices);
@@ -56,7 +56,7 @@ pub(crate) fn closed_parts(mesh: &Mesh) -> (Vec<ClosedPart>, Vec<Corner>) {
     (parts.iter().map(|part| turned(&corners, &faces, part)).collect(), first_corners(&corners, &indices))
 }
 
-/// The closed parts of what hangs together; `None` where it is not closed.
+/// The closed parts of a connected part; `None` where it is not closed.
 fn closed(faces: &[Face], part: &[u32]) -> Option<Vec<Vec<u32>>> {
     let (odd, even): (Vec<u32>, Vec<u32>) = part.iter().partition(|face| faces[**face as usize].is_odd);
     if !odd.is_empty() && is_closed(faces, &odd) {
@@ -75,13 +75,13 @@ fn first_corners(corners: &[Corner], indices: &[Indices]) -> Vec<Corner> {
     (0..joined.len()).filter(|corner| joined[*corner] as usize == *corner).map(|corner| corners[corner]).collect()
 }
 
-/// Corners with equal coordinates have one number.
+/// Gives corners with equal coordinates the same index.
 fn numbered(mesh: &Mesh) -> (Vec<Corner>, Vec<Indices>) {
     let mut numbers: BTreeMap<[u64; 3], u32> = BTreeMap::new();
     let (mut corners, mut indices) = (Vec::new(), Vec::with_capacity(mesh.triangles().len()));
     for triangle in mesh.triangles() {
         indices.push(triangle.map(|corner| {
-            // Minus zero is zero.
+            // Makes minus zero equal to zero.
             let key = corner.map(|c| (c + 0.0).to_bits());
             *numbers.entry(key).or_insert_with(|| {
                 corners.push(corner);
@@ -92,7 +92,7 @@ fn numbered(mesh: &Mesh) -> (Vec<Corner>, Vec<Indices>) {
     (corners, indices)
 }
 
-/// Each triangle once, without those that are lines.
+/// Each triangle once, without degenerate ones.
 fn faces(indices: &[Indices]) -> Vec<Face> {
     let sorted = |mut corners: Indices| {
         corners.sort_unstable();
@@ -105,7 +105,7 @@ fn faces(indices: &[Indices]) -> Vec<Face> {
     let same = all.chunk_by(|a, b| a.0 == b.0);
     same.map(|same| {
         let key = same[0].0;
-        // Whether the corners follow each other as the sorted ones do.
+        // Whether the corners are in the same cyclic order as the sorted ones.
         let ahead =
             |corners: Indices| [[0, 1, 2], [1, 2, 0], [2, 0, 1]].iter().any(|order| order.map(|i| key[i]) == corners);
         let sum: i32 = same.iter().map(|(_, corners)| if ahead(*corners) { 1 } else { -1 }).sum();
@@ -115,7 +115,8 @@ fn faces(indices: &[Indices]) -> Vec<Face> {
     .collect()
 }
 
-/// An edge of a face, from the lower corner to the higher, the face by its place in a list, and whether it walks it upwards.
+/// An edge of a face: its corners with the lower index first, the face's index in a list, and whether the face uses the edge from the lower to
+/// the higher corner.
 type Edge = ((u32, u32), u32, bool);
 
 fn edges(faces: &[Face], list: &[u32]) -> Vec<Edge> {
@@ -134,12 +135,12 @@ fn at_each_edge(edges: &[Edge]) -> impl Iterator<Item = &[Edge]> {
     edges.chunk_by(|a, b| a.0 == b.0)
 }
 
-/// The parts of a list of faces that hang together by edges.
+/// The parts of a list of faces that are connected by edges.
 fn connected(faces: &[Face], list: &[u32]) -> Vec<Vec<u32>> {
     joined_at(faces, list, |_| true)
 }
 
-/// The same by those edges alone where so many faces meet.
+/// The same, using only edges where `is_joint` holds for the number of faces.
 fn joined_at(faces: &[Face], list: &[u32], is_joint: impl Fn(usize) -> bool) -> Vec<Vec<u32>> {
     let mut joined: Vec<u32> = (0..list.len() as u32).collect();
     for same in at_each_edge(&edges(faces, list)).filter(|same| is_joint(same.len())) {
@@ -156,7 +157,7 @@ fn is_closed(faces: &[Face], list: &[u32]) -> bool {
     at_each_edge(&edges(faces, list)).all(|same| same.len() % 2 == 0)
 }
 
-/// A closed part, turned consistently if it can be.
+/// A closed part, oriented consistently if possible.
 fn turned(corners: &[Corner], faces: &[Face], list: &[u32]) -> ClosedPart {
     let edges = edges(faces, list);
     let is_balanced = |same: &[Edge]| 2 * same.iter().filter(|(_, _, up)| *up).count() == same.len();
@@ -178,7 +179,8 @@ fn turned(corners: &[Corner], faces: &[Face], list: &[u32]) -> ClosedPart {
     ClosedPart { triangles, is_oriented, sense }
 }
 
-/// Which faces to turn so that both faces at an edge walk it in opposite directions; `None` where more than two meet, or it is one-sided.
+/// The faces to flip so that both faces at an edge use it in opposite directions; `None` where more than two faces meet, or where the surface is
+/// one-sided.
 fn consistent(edges: &[Edge], count: usize) -> Option<Vec<bool>> {
     let mut beside: Vec<Vec<(u32, bool)>> = vec![Vec::new(); count];
     for same in at_each_edge(edges) {
@@ -206,7 +208,7 @@ fn consistent(edges: &[Edge], count: usize) -> Option<Vec<bool>> {
     turned.into_iter().collect()
 }
 
-/// Six times the volume, negative where triangles turn to the right.
+/// Six times the signed volume, negative where triangles are clockwise.
 fn volume(triangles: &[[Corner; 3]]) -> f64 {
     let origin = triangles[0][0];
     let of = |triangle: &[Corner; 3]| {
@@ -219,7 +221,7 @@ fn volume(triangles: &[[Corner; 3]]) -> f64 {
 
 fn join(joined: &mut [u32], a: u32, b: u32) {
     let (a, b) = (root(joined, a), root(joined, b));
-    // The lower number stays, so that the first corner of a part is its root.
+    // The lower index stays, so that the first corner of a part is its root.
     joined[a.max(b) as usize] = a.min(b);
 }
 

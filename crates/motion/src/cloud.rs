@@ -1,7 +1,7 @@
-//! Clouds of points as obstacles: every point is the centre of a ball, all of one radius.
+//! Point clouds as obstacles: every point is the centre of a sphere, all of one radius.
 //!
-//! A cloud can be thinned within a bound that is given, and what a camera saw of the robot itself can be left out. Its points are kept by the
-//! cells of a grid, so that what is near a shape of the robot is found without looking at all of them.
+//! A cloud can be thinned within a given bound, and points on the robot itself can be removed. Points are stored by the cells of a grid, so
+//! that those near a shape of the robot are found without visiting all of them.
 
 use crate::exact::Exact;
 use crate::inside::Inside;
@@ -11,44 +11,44 @@ use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
 use std::collections::BTreeSet;
 
-/// The most points of a cloud.
+/// Maximum number of points in a cloud.
 pub const MAX_POINTS: usize = 4_000_000;
 
-/// The largest radius, in metres.
+/// Maximum radius, in metres.
 pub const MAX_RADIUS_M: f64 = 1.0;
 
-/// The least bound of thinning, in metres: `f32` holds what is a kilometre away no better than by 0.06 mm.
+/// Minimum bound of thinning, in metres: an `f32` resolves only 0.06 mm at a distance of a kilometre.
 pub const LEAST_THINNING_M: f64 = 1e-6;
 
-/// How far from the origin a point may be, in metres.
+/// Maximum distance of a point from the origin, in metres.
 const FARTHEST_M: f32 = 1e3;
 
-/// Cells at the most, about, and for each point.
+/// Approximate maximum number of cells, in total and per point.
 const MOST_CELLS: f64 = 262_144.0;
 const CELLS_PER_POINT: f64 = 16.0;
 
-/// Why there is no cloud.
+/// Why a cloud cannot be made.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CloudError {
-    /// Too many.
+    /// Too many points.
     #[error("it has {points} points, at most {MAX_POINTS} are supported: thin it first")]
     TooMany {
-        /// How many.
+        /// Their number.
         points: usize,
     },
-    /// A coordinate that cannot be.
+    /// A coordinate is not finite or too large.
     #[error("point {point} is not finite or beyond a kilometre: drop such points first")]
     NotFinite {
-        /// Counted from 0.
+        /// Index of the point, from 0.
         point: usize,
     },
-    /// No radius of a ball.
+    /// The radius is out of range.
     #[error("the radius of its points is {radius_m} m: expected more than 0, and at most {MAX_RADIUS_M}")]
     Radius {
         /// In metres.
         radius_m: f64,
     },
-    /// A cloud cannot be thinned so.
+    /// The bound of thinning is out of range.
     #[error("the bound of thinning is {bound_m} m: expected 0, or {LEAST_THINNING_M} to {MAX_RADIUS_M}")]
     Thinning {
         /// In metres.
@@ -56,23 +56,23 @@ pub enum CloudError {
     },
 }
 
-/// Balls of one radius, in the frame of the robot's first link.
+/// Spheres of one radius, in the frame of the robot's first link.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Cloud {
-    /// For messages.
+    /// The name for messages.
     pub name: String,
     radius_m: f64,
-    /// By cells.
+    /// Sorted by cell.
     points: Vec<[f32; 3]>,
     least: [f32; 3],
     cell: f32,
     counts: [usize; 3],
-    /// Per cell, where its points begin.
+    /// For each cell, the index of its first point.
     starts: Vec<u32>,
 }
 
 impl Cloud {
-    /// Balls about `points`.
+    /// Makes spheres with these centres.
     ///
     /// # Errors
     /// [`CloudError`] names the point or the radius.
@@ -119,21 +119,21 @@ impl Cloud {
         Ok(cloud)
     }
 
-    /// The centres of the balls, in an order of its own.
+    /// The centres of the spheres, in no particular order.
     pub fn points(&self) -> &[[f32; 3]] {
         &self.points
     }
 
-    /// The radius of the balls, in metres.
+    /// The radius of the spheres, in metres.
     pub fn radius_m(&self) -> f64 {
         self.radius_m
     }
 
-    /// Fewer and larger balls that hold all of these and stand out of them by at most `bound_m` metres: of all points in one cell of a grid
-    /// one is left. A bound of 0 changes nothing.
+    /// Fewer and larger spheres that contain all of these and protrude by at most `bound_m` metres: one point is kept in each cell of a grid.
+    /// A bound of 0 changes nothing.
     ///
     /// # Errors
-    /// [`CloudError::Thinning`] where the bound is no such length, [`CloudError::Radius`] where the balls become too large.
+    /// [`CloudError::Thinning`] where the bound is out of range, [`CloudError::Radius`] where the spheres become too large.
     pub fn thinned(&self, bound_m: f64) -> Result<Cloud, CloudError> {
         if bound_m == 0.0 {
             return Ok(self.clone());
@@ -145,14 +145,14 @@ impl Cloud {
         let mut taken = BTreeSet::new();
         let is_first = |point: &&[f32; 3]| taken.insert(point.map(|c| (f64::from(c) / side).floor() as i64));
         let points: Vec<[f32; 3]> = self.points.iter().filter(is_first).copied().collect();
-        // A little more than the diagonal of a cell, for rounding.
+        // A little more than the diagonal of a cell, because of rounding.
         Cloud::new(&self.name, &points, self.radius_m + bound_m * 1.001)
     }
 
-    /// Without the balls that come within `margin_m` metres of the robot in a posture: what a camera saw of the robot itself.
+    /// Removes the spheres within `margin_m` metres of the robot in a posture: what a camera saw of the robot itself.
     ///
     /// # Errors
-    /// None that the cloud does not have already.
+    /// No errors beyond those of [`Cloud::new`].
     pub fn without_robot(&self, mechanism: &Mechanism, positions: &[f64], margin_m: f64) -> Result<Cloud, CloudError> {
         let own = Exact::new(mechanism, &[]).points_near(positions, self, margin_m);
         let points: Vec<[f32; 3]> =
@@ -160,7 +160,7 @@ impl Cloud {
         Cloud::new(&self.name, &points, self.radius_m)
     }
 
-    /// Moved.
+    /// Moves the cloud by a pose.
     ///
     /// # Errors
     /// [`CloudError::NotFinite`] where points are moved too far.
@@ -170,7 +170,7 @@ impl Cloud {
         Cloud::new(&self.name, &points, self.radius_m)
     }
 
-    /// Shows the numbers and places of the points in a box, until it hears that no more are wanted.
+    /// Passes the index and position of each point in a box to `wants_more`, until that returns false.
     fn visit(&self, least: [f32; 3], greatest: [f32; 3], wants_more: &mut dyn FnMut(usize, [f32; 3]) -> bool) {
         let beyond = |i: usize| {
             let end = self.least[i] + self.counts[i] as f32 * self.cell;
@@ -194,8 +194,8 @@ impl Cloud {
         }
     }
 
-    /// Shows the points nearer than `within` metres to a shape in its pose, by number, and how far each is from its surface, negative inside,
-    /// until it hears that no more are wanted. What is inside a mesh says `inside`; other shapes know it by themselves.
+    /// Passes the index of each point nearer than `within` metres to a shape in its pose, and its signed distance from the surface (negative
+    /// inside), to `wants_more`, until that returns false. For a mesh, `inside` tells what is inside; other shapes know it themselves.
     pub(crate) fn visit_near(
         &self,
         pose: &Pose32,

@@ -1,9 +1,9 @@
-//! Reading Collada (.dae): the geometries that the scene shows, moved as its nodes say, in metres by its `unit`.
+//! Reads Collada (.dae): the geometries in the scene, transformed by their nodes, in metres according to the file's `unit`.
 //!
-//! As in ROS the `up_axis` is not applied: the axes are those of the file. Triangles and polygons are read; normals, textures
-//! and cameras are not. Skinned meshes and polygons with holes are refused, and faces that do not use up their list of
-//! corners. A geometry is read once, however often the scene shows it. Of materials the diffuse colour is read; what is wrong with one costs the
-//! colour alone, as it says nothing of the shape.
+//! As in ROS, `up_axis` is not applied: the axes are those of the file. Triangles and polygons are read; normals, textures and cameras are not.
+//! Skinned meshes, polygons with holes, and faces that do not use their whole list of corners are refused. A geometry is read once, however
+//! often the scene contains it. Of materials only the diffuse colour is read; an error in a material costs only the colour, because it does not
+//! affect the shape.
 
 use crate::mesh::{Colour, MAX_TRIANGLES, MeshError, Part};
 use crate::polygon;
@@ -15,20 +15,20 @@ use xml::reader::XmlEvent;
 type Matrix = [[f64; 4]; 3];
 type Triangle = [[f64; 3]; 3];
 
-/// Nodes in nodes at the most, also where they are instances.
+/// Maximum depth of nested nodes, including instances.
 const DEEPEST: usize = 64;
 
-/// Elements of the scene at the most, those of a node as often as an instance shows it; a long text counts for more.
+/// Maximum number of elements in the scene, where those of a node count for each instance; a long text counts for more.
 const MOST_SHOWN: usize = 1_000_000;
 const LONG_TEXT: usize = 1_000;
 
-/// Elements of a file at the most.
+/// Maximum number of elements in a file.
 const MOST_ELEMENTS: usize = 1_000_000;
 
-/// Positions of all sources at the most: three for each triangle.
+/// Maximum number of positions in all sources: three for each triangle.
 const MOST_POSITIONS: usize = 3 * MAX_TRIANGLES;
 
-/// The greatest `offset` of an input and `stride` of an accessor.
+/// Maximum `offset` of an input and `stride` of an accessor.
 const MOST_APART: usize = 1_000;
 
 const IDENTITY: Matrix = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
@@ -60,7 +60,7 @@ pub(crate) fn parts(bytes: &[u8]) -> Result<Vec<Part>, MeshError> {
                 file.node(node, &IDENTITY, 0)?;
             }
         }
-        // Without a scene everything is shown.
+        // Without a scene, all geometries are shown.
         None => {
             for library in root.children_named("library_geometries") {
                 for geometry in library.children_named("geometry") {
@@ -122,13 +122,13 @@ impl Element {
         numbers.try_into().map_err(|_| self.wrong(format!("`{}` has {count} numbers: expected {N}", self.name)))
     }
 
-    /// A whole number in an attribute.
+    /// An attribute that is a whole number; `other` where it is missing.
     fn count(&self, name: &str, other: usize) -> Result<usize, MeshError> {
         let parse = |text: &str| text.trim().parse().map_err(|_| self.wrong(format!("`{name}` is no whole number")));
         self.attribute(name).map_or(Ok(other), parse)
     }
 
-    /// As [`Element::count`], at least `least` and no more than [`MOST_APART`].
+    /// As [`Element::count`], from `least` to [`MOST_APART`].
     fn bounded(&self, name: &str, other: usize, least: usize) -> Result<usize, MeshError> {
         let count = self.count(name, other)?;
         if !(least..=MOST_APART).contains(&count) {
@@ -192,20 +192,20 @@ fn collect<'e>(element: &'e Element, by_id: &mut BTreeMap<&'e str, &'e Element>)
 
 struct File<'e> {
     by_id: BTreeMap<&'e str, &'e Element>,
-    /// What has been read, by the place of its element in memory: geometries as the file has them,
+    /// What has been read so far, by the address of its element: geometries as in the file,
     geometries: BTreeMap<*const Element, Rc<[Painted<'e>]>>,
     /// and positions of `vertices` and of sources.
     positions: BTreeMap<*const Element, Rc<[[f64; 3]]>>,
-    /// How many these are, and the numbers of arrays, which several sources may share.
+    /// Number of these positions, and the arrays of numbers, which several sources may share.
     read: usize,
     arrays: BTreeMap<*const Element, Rc<[f64]>>,
-    /// The scene, and how many triangles and elements it has so far.
+    /// The scene, and its number of triangles and elements so far.
     shown: Vec<Part>,
     triangles: usize,
     elements: usize,
 }
 
-/// Triangles of a geometry with the symbol of their material, which means something where the geometry is shown.
+/// Triangles of a geometry with their material's symbol, which is resolved where the geometry is instanced.
 struct Painted<'e> {
     material: Option<&'e str>,
     triangles: Vec<Triangle>,
@@ -267,7 +267,7 @@ impl<'e> File<'e> {
         Ok(())
     }
 
-    /// Adds the triangles of a geometry to the scene, with the materials of its instance there.
+    /// Adds the triangles of a geometry to the scene, with the materials of that instance.
     fn show(&mut self, geometry: &'e Element, instance: Option<&'e Element>, place: &Matrix) -> Result<(), MeshError> {
         self.count(geometry)?;
         let painted = match self.geometries.get(&std::ptr::from_ref(geometry)) {
@@ -282,7 +282,7 @@ impl<'e> File<'e> {
         if self.triangles > MAX_TRIANGLES {
             return Err(MeshError::Count { triangles: self.triangles });
         }
-        // What is mirrored is turned, so that the same side is outside.
+        // A mirrored part gets the reverse order of corners, so that the same side is outside.
         let is_mirrored = determinant(place) < 0.0;
         for part in painted.iter() {
             let colour = part.material.and_then(|symbol| self.colour(symbol, instance));
@@ -298,7 +298,7 @@ impl<'e> File<'e> {
         Ok(())
     }
 
-    /// The diffuse colour of the material that a symbol means where a geometry is shown.
+    /// The diffuse colour of the material to which an instance binds a symbol.
     fn colour(&self, symbol: &str, instance: Option<&'e Element>) -> Option<Colour> {
         let bound = instance?.child("bind_material")?.child("technique_common")?;
         let is_meant = |one: &&Element| one.attribute("symbol") == Some(symbol);
@@ -402,13 +402,13 @@ impl<'e> File<'e> {
 struct Faces<'e> {
     part: &'e Element,
     positions: &'e [[f64; 3]],
-    /// Numbers of a corner, and which of them names the vertex.
+    /// Numbers per corner, and which of them is the vertex's index.
     stride: usize,
     offset: usize,
 }
 
 impl Faces<'_> {
-    /// Adds the triangles of all faces; gives the number of faces.
+    /// Adds the triangles of all faces; returns the number of faces.
     fn read(&self, triangles: &mut Vec<Triangle>) -> Result<usize, MeshError> {
         let part = self.part;
         if part.child("ph").is_some() {
@@ -451,7 +451,7 @@ impl Faces<'_> {
         }
     }
 
-    /// The vertices that a list names.
+    /// The vertex indices in a list.
     fn corners(&self, list: &Element) -> Result<Vec<usize>, MeshError> {
         let indices: Vec<usize> = list.numbers()?;
         if !indices.len().is_multiple_of(self.stride) {
@@ -479,7 +479,7 @@ impl Faces<'_> {
     }
 }
 
-/// Positions among numbers, as an accessor says; its parameters without a name are passed over.
+/// The positions in an array of numbers, according to an accessor; parameters without a name are skipped.
 fn positions(source: &Element, accessor: Option<&Element>, numbers: &[f64]) -> Result<Vec<[f64; 3]>, MeshError> {
     let Some(accessor) = accessor else {
         return Ok(numbers.chunks_exact(3).map(|at| [at[0], at[1], at[2]]).collect());
@@ -498,7 +498,7 @@ fn positions(source: &Element, accessor: Option<&Element>, numbers: &[f64]) -> R
     let offset = accessor.count("offset", 0)?;
     let all = numbers.get(offset..).unwrap_or(&[]);
     let count = accessor.count("count", all.len() / stride)?;
-    // The last one may end before its stride.
+    // The last position may end before its stride.
     let last = [x, y, z].into_iter().max().unwrap_or(0);
     let needed = count.checked_sub(1).map_or(Some(0), |others| others.checked_mul(stride)?.checked_add(last + 1));
     if needed.is_none_or(|needed| needed > all.len()) {
@@ -514,7 +514,7 @@ fn matrix(rows: &[f64; 16]) -> Matrix {
     std::array::from_fn(|row| std::array::from_fn(|column| rows[4 * row + column]))
 }
 
-/// About an axis, in degrees (Rodrigues).
+/// A rotation about an axis, in degrees (Rodrigues).
 fn rotation(element: &Element) -> Result<Matrix, MeshError> {
     let [x, y, z, degrees] = element.floats()?;
     let length = f64::sqrt(x * x + y * y + z * z);

@@ -1,42 +1,42 @@
-//! Heights over a grid, as a solid: the ground, a pile, what a scanner saw from above.
+//! Heights over a grid as a solid: terrain, a pile, or a scan from above.
 //!
-//! Rows run along y and columns along x, the middle of the grid is the origin. Between four heights there are two triangles. What is
-//! under the heights is filled down to a bottom. Heights are read from text (a row per line; semicolons, commas or spaces, the first of these
-//! that a line has) or from a grey image (PGM, text or binary, of 8 or 16 bits); the first line is the row with the greatest y, as one sees it from above.
+//! Rows run along y and columns along x, the centre of the grid is the origin. Two triangles lie between each four heights. The solid reaches down to a
+//! bottom. Heights are read from text (a row per line, separated by semicolons, commas or spaces, whichever of these a line contains first in this order)
+//! or from a grey image (PGM, text or binary, with 8 or 16 bits); the first line is the row with the greatest y, as seen from above.
 
 use crate::mesh::{MAX_TRIANGLES, Mesh, MeshError};
 
-/// Heights along one side at the most.
+/// Maximum number of heights along a side.
 pub const MOST_ALONG: usize = 4096;
 
 /// Why there are no heights.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum HeightsError {
-    /// Something is no number, or a row has another length.
+    /// Something is not a number, or a row has another length.
     #[error("line {line}: {reason}")]
     Text {
-        /// Counted from 1.
+        /// Line number, from 1.
         line: usize,
         /// What is wrong.
         reason: String,
     },
-    /// An image that is not whole, or of another kind.
+    /// The image is incomplete, or of another format.
     #[error("at byte {offset}: {reason}")]
     Image {
-        /// Counted from 0.
+        /// Byte offset, from 0.
         offset: usize,
         /// What is wrong.
         reason: String,
     },
-    /// Sizes that cannot be.
+    /// The size of the grid is not supported.
     #[error("{columns} × {rows} heights: expected 2 to {MOST_ALONG} along each side")]
     Size {
-        /// Along x.
+        /// Number along x.
         columns: usize,
-        /// Along y.
+        /// Number along y.
         rows: usize,
     },
-    /// What becomes of it is no mesh.
+    /// The solid cannot be made into a mesh.
     #[error(transparent)]
     Mesh(#[from] MeshError),
 }
@@ -45,15 +45,15 @@ pub enum HeightsError {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Heights {
     columns: usize,
-    /// Row after row, the least y first.
+    /// Row by row, from the least y.
     heights: Vec<f64>,
 }
 
 impl Heights {
-    /// Rows of heights, the least y first, each from the least x on.
+    /// Rows of heights, from the least y, each from the least x.
     ///
     /// # Errors
-    /// [`HeightsError::Size`] where rows differ, or are too few or too many.
+    /// [`HeightsError::Size`] where rows differ in length, or are too few or too many.
     pub fn new(columns: usize, heights: Vec<f64>) -> Result<Heights, HeightsError> {
         let rows = heights.len() / columns.max(1);
         let fits = |count: usize| (2..=MOST_ALONG).contains(&count);
@@ -63,10 +63,10 @@ impl Heights {
         Ok(Heights { columns, heights })
     }
 
-    /// Reads text or a PGM image; numbers are multiplied by `scale` to be metres.
+    /// Reads text or a PGM image; `scale` converts the numbers to metres.
     ///
     /// # Errors
-    /// [`HeightsError`] names the line, or the byte.
+    /// [`HeightsError`] names the line or the byte.
     pub fn read(bytes: &[u8], scale: f64) -> Result<Heights, HeightsError> {
         let (columns, mut heights) = match bytes {
             [b'P', b'2' | b'5', ..] => pgm(bytes)?,
@@ -81,19 +81,19 @@ impl Heights {
         Heights::new(columns, rows.concat())
     }
 
-    /// The solid between the heights and a bottom; `size` is how long the grid is along x and y, in metres.
+    /// The solid between the heights and a bottom; `size` is the grid's extent along x and y, in metres.
     ///
     /// # Errors
     /// [`HeightsError::Mesh`] where it is not finite or has too many triangles.
     pub fn solid(&self, size: [f64; 2], bottom: f64) -> Result<Mesh, HeightsError> {
         let (columns, rows) = (self.columns, self.heights.len() / self.columns);
-        // Two between four heights, three below each height at the edge.
+        // Two triangles between each four heights, three below each height at the edge.
         let count = 2 * (columns - 1) * (rows - 1) + 6 * (columns + rows - 2);
         if count > MAX_TRIANGLES {
             return Err(MeshError::Count { triangles: count }.into());
         }
         let least = self.heights.iter().copied().fold(f64::INFINITY, f64::min);
-        // Above the least height the bottom would cut the surface.
+        // A bottom above the least height would intersect the surface.
         let bottom = bottom.min(least - 1e-3);
         let along = |i: usize, count: usize, size: f64| (i as f64 / (count - 1) as f64 - 0.5) * size;
         let flat = |x: usize, y: usize| [along(x, columns, size[0]), along(y, rows, size[1])];
@@ -106,7 +106,7 @@ impl Heights {
                 triangles.extend([[a, b, c], [a, c, d]].map(|t| t.map(top)));
             }
         }
-        // Round the edge, the inside to the left.
+        // Around the edge, with the inside to the left.
         let mut edge: Vec<(usize, usize)> = (0..columns - 1).map(|x| (x, 0)).collect();
         edge.extend((0..rows - 1).map(|y| (columns - 1, y)));
         edge.extend((1..columns).rev().map(|x| (x, rows - 1)));
@@ -164,7 +164,7 @@ fn text(bytes: &[u8]) -> Result<(usize, Vec<f64>), HeightsError> {
     Ok((columns, heights))
 }
 
-/// A portable grey map.
+/// A PGM image (portable grey map).
 fn pgm(bytes: &[u8]) -> Result<(usize, Vec<f64>), HeightsError> {
     let mut at = 2;
     let wrong = |offset: usize, reason: &str| HeightsError::Image { offset, reason: reason.to_owned() };

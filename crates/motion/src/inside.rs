@@ -1,13 +1,13 @@
-//! What is inside a mesh: where its closed parts (`closed_parts.rs`) are solid. Which way the triangles of a file are turned
-//! makes no difference to a part that stands for itself, nor where such parts overlap.
+//! The inside of a mesh: where its closed parts (`closed_parts.rs`) are solid. The orientation of a file's triangles makes no difference to a part by itself,
+//! nor where separate parts overlap.
 //!
-//! A part holds a point if a straight line upwards from there leaves it more often than it enters it (or the other way round). It is solid by
-//! itself, and so is a part wholly inside another that is turned as the outermost part around it; one that is turned the other way is a
-//! hollow. Wholly inside is what has its corners and the middles of its triangles there, and a surface that does not meet the other's; a part
-//! that touches the one around it is solid. Where the file does not say how a part is turned, it is a hollow inside what is solid, and solid inside a hollow. Solid parts
-//! count one, hollows count minus one: inside is where the sum is not zero.
+//! A part contains a point if a vertical ray upwards from there leaves the part more often than it enters it (or vice versa). A part by itself is solid. A part
+//! wholly inside another is solid if it has the same orientation as the outermost part around it, and a hollow if it has the other one. A part is wholly inside
+//! another if its corners and the centres of its triangles are, and if the surfaces do not meet; a part that touches the one around it is solid. Where the file
+//! does not tell a part's orientation, it is a hollow inside a solid, and solid inside a hollow. Solid parts count one, hollows minus one: a point is inside
+//! where the sum is not zero.
 //!
-//! The triangles are listed by the cells of a grid that they lie above, so a line looks at a few of them.
+//! The triangles are listed by the cells of a grid below them, so a ray only tests a few of them.
 
 use crate::closed_parts::closed_parts;
 use crate::mesh::Mesh;
@@ -17,16 +17,16 @@ use parry3d::shape::SharedShape;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 
-/// Cells along one side of the grid at the most.
+/// Maximum number of cells along a side of the grid.
 const MOST_CELLS: usize = 256;
 
-/// Triangles that are looked at to find parts inside others, at the most; parts that are left then count as solid.
+/// Maximum number of triangles tested to find parts inside others; remaining parts count as solid.
 const MOST_LOOKS: usize = 200_000_000;
 
-/// Pairs of surfaces that are looked at for where they meet, at the most; parts that are left count as solid.
+/// Maximum number of pairs of surfaces that are tested for intersection; remaining parts count as solid.
 const MOST_MEETINGS: usize = 20_000;
 
-/// How often triangles are listed at the most, for each of them and beside that; the grid becomes coarser where it would be more often.
+/// Maximum number of list entries, per triangle and in addition; the grid becomes coarser if there would be more.
 const MOST_LISTED: usize = 16;
 const MOST_LISTED_MORE: usize = 65_536;
 
@@ -35,19 +35,19 @@ type Corner = [f64; 3];
 /// A closed part.
 #[derive(Debug, Clone, Copy)]
 struct Part {
-    /// Whether the winding number tells what it holds; else the number of crossings.
+    /// Whether the winding number tells its inside; otherwise the number of crossings does.
     is_oriented: bool,
-    /// How it is turned, as [`ClosedPart::sense`](crate::closed_parts::ClosedPart::sense).
+    /// Its orientation, as [`ClosedPart::sense`](crate::closed_parts::ClosedPart::sense).
     sense: i32,
-    /// 1 where it is solid, -1 where it is a hollow.
+    /// 1 for a solid part, -1 for a hollow.
     weight: i32,
 }
 
-/// Where a line crosses the surface.
+/// A crossing of a line with the surface.
 #[derive(Debug, Clone, Copy)]
 struct Crossing {
     z: f64,
-    /// Seen from above or from below.
+    /// 1 or -1 by the triangle's orientation as seen from above.
     turn: i32,
     part: u32,
 }
@@ -55,18 +55,18 @@ struct Crossing {
 /// The inside of a mesh.
 #[derive(Debug, Clone)]
 pub struct Inside {
-    /// Of parts that are closed.
+    /// Triangles of closed parts.
     triangles: Vec<[Corner; 3]>,
-    /// Per triangle.
+    /// For each triangle, its part.
     part: Vec<u32>,
     parts: Vec<Part>,
     least: Corner,
     greatest: Corner,
     /// The least and the greatest x and y of the grid.
     grid: [[f64; 2]; 2],
-    /// Cells along each side.
+    /// Number of cells along each side.
     side: usize,
-    /// Per cell, where its triangles begin in `listed`.
+    /// For each cell, the index of its first triangle in `listed`.
     starts: Vec<u32>,
     listed: Vec<u32>,
     /// A corner of each part, closed or not.
@@ -104,24 +104,24 @@ impl Inside {
         inside
     }
 
-    /// The same, ready for points with x and y from `least` to `greatest` only: others are not inside any more.
+    /// The same, prepared only for points with x and y from `least` to `greatest`: other points count as outside.
     pub(crate) fn above(mut self, [least, greatest]: [[f64; 2]; 2]) -> Inside {
         self.grid = [[0, 1].map(|i| self.grid[0][i].max(least[i])), [0, 1].map(|i| self.grid[1][i].min(greatest[i]))];
         self.list();
         self
     }
 
-    /// Whether there is any.
+    /// Whether there is no inside.
     pub fn is_empty(&self) -> bool {
         self.triangles.is_empty()
     }
 
-    /// The least and the greatest coordinates of closed parts; infinite where there are none.
+    /// The least and the greatest coordinates of the closed parts; infinite where there are none.
     pub fn extents(&self) -> (Corner, Corner) {
         (self.least, self.greatest)
     }
 
-    /// A corner of each part of the mesh, closed or not: where no surfaces meet, a part is inside something if its corner is.
+    /// A corner of each part of the mesh, closed or not: where surfaces do not meet, a part is inside something if its corner is.
     pub fn corners(&self) -> &[Corner] {
         &self.corners
     }
@@ -138,7 +138,7 @@ impl Inside {
     /// The intervals of z in which the vertical line at (x, y) is inside.
     pub fn column(&self, x: f64, y: f64) -> Vec<[f64; 2]> {
         let mut crossings = self.crossings(x, y);
-        // From above.
+        // From the top.
         crossings.sort_by(|a, b| b.z.total_cmp(&a.z));
         let mut parts: Vec<u32> = crossings.iter().map(|crossing| crossing.part).collect();
         parts.sort_unstable();
@@ -161,7 +161,7 @@ impl Inside {
         intervals
     }
 
-    /// The parts that hold a point, sorted.
+    /// The parts that contain a point, sorted.
     fn holding(&self, [x, y, z]: Corner) -> Vec<u32> {
         let mut above: Vec<Crossing> = self.crossings(x, y).into_iter().filter(|crossing| crossing.z > z).collect();
         above.sort_unstable_by_key(|crossing| crossing.part);
@@ -174,7 +174,7 @@ impl Inside {
         tallies.filter(|tally| tally.holds(&self.parts)).map(|tally| tally.part).collect()
     }
 
-    /// Where the vertical line at (x, y) crosses the surface.
+    /// The crossings of the vertical line at (x, y) with the surface.
     fn crossings(&self, x: f64, y: f64) -> Vec<Crossing> {
         let Some(cell) = self.cell(x, y) else { return Vec::new() };
         let crossing = |triangle: &u32| {
@@ -189,13 +189,13 @@ impl Inside {
         &self.listed[self.starts[cell] as usize..self.starts[cell + 1] as usize]
     }
 
-    /// Finds the parts that are hollows of others, the largest first.
+    /// Finds the parts that are hollows of others, largest first.
     fn find_hollows(&mut self) {
         let first = self.parts.first().map_or(0, |part| part.sense);
         if first != 0 && self.parts.iter().all(|part| part.sense == first) {
             return;
         }
-        // The triangles of a part follow each other.
+        // The triangles of a part are consecutive.
         let ranges: Vec<Range<usize>> = self
             .part
             .chunk_by(|a, b| a == b)
@@ -233,7 +233,7 @@ impl Inside {
         }
     }
 
-    /// The parts that a part is wholly inside of, by all its corners and the middles of its triangles.
+    /// The parts that contain all corners and all triangle centres of a part.
     fn around(&self, part: usize, range: &Range<usize>, looks: &mut usize) -> Vec<usize> {
         let mut around: Option<BTreeSet<u32>> = None;
         for triangle in &self.triangles[range.clone()] {
@@ -257,7 +257,7 @@ impl Inside {
         around.into_iter().flatten().map(|other| other as usize).collect()
     }
 
-    /// How many triangles are looked at for a vertical line at (x, y).
+    /// Number of triangles tested for a vertical line at (x, y).
     pub(crate) fn load(&self, x: f64, y: f64) -> usize {
         self.cell(x, y).map_or(0, |cell| self.listed(cell).len())
     }
@@ -274,7 +274,7 @@ impl Inside {
         (((at - least) / extent * self.side as f64) as usize).min(self.side - 1)
     }
 
-    /// The first and the last cell along x, then along y, that a triangle may lie above.
+    /// The first and the last cell along x, then along y, below a triangle.
     fn beneath(&self, triangle: &[Corner; 3]) -> Option<[[usize; 2]; 2]> {
         let range = |i: usize| {
             let along = triangle.map(|c| c[i]);
@@ -286,7 +286,7 @@ impl Inside {
         Some([range(0)?, range(1)?])
     }
 
-    /// Counts first, then fills; as fine as the bound on the lists allows.
+    /// Counts first, then fills; as fine as the limit on the lists allows.
     fn list(&mut self) {
         let most = MOST_LISTED * self.triangles.len() + MOST_LISTED_MORE;
         self.side = ((self.triangles.len() as f64).sqrt().ceil() as usize).clamp(1, MOST_CELLS);
@@ -312,7 +312,7 @@ impl Inside {
         (self.starts, self.listed) = (starts, listed);
     }
 
-    /// Shows each cell with each triangle that may lie above it.
+    /// Passes each cell with each triangle above it to `show`.
     fn visit(&self, show: &mut dyn FnMut(usize, u32)) {
         for (number, triangle) in self.triangles.iter().enumerate() {
             let Some([x, y]) = self.beneath(triangle) else { continue };
@@ -323,7 +323,7 @@ impl Inside {
     }
 }
 
-/// The surfaces of parts, by where their triangles begin.
+/// The surfaces of parts, by the index of their first triangle.
 #[derive(Default)]
 struct Surfaces {
     shapes: BTreeMap<usize, SharedShape>,
@@ -331,7 +331,7 @@ struct Surfaces {
 }
 
 impl Surfaces {
-    /// Whether two parts meet, as far as one can tell.
+    /// Whether the surfaces of two parts meet; true where that is unknown.
     fn meet(&mut self, triangles: &[[Corner; 3]], a: &Range<usize>, b: &Range<usize>) -> bool {
         self.looks += 1;
         if self.looks > MOST_MEETINGS {
@@ -347,7 +347,7 @@ impl Surfaces {
     }
 }
 
-/// How often a line has crossed a part.
+/// Crossings of a line with a part.
 #[derive(Debug)]
 struct Tally {
     part: u32,
@@ -366,13 +366,13 @@ impl Tally {
     }
 }
 
-/// Where a vertical line crosses a triangle. A line through an edge or a corner crosses exactly one of the triangles beside it: edges are
-/// looked at in one direction for both, and what is on an edge belongs to one side.
+/// The crossing of a vertical line with a triangle. A line through an edge or a corner crosses exactly one of the adjacent triangles: both evaluate the edge in
+/// the same direction, and a point on the edge belongs to one side.
 fn crossing(triangle: &[Corner; 3], x: f64, y: f64) -> Option<(f64, i32)> {
     let mut beyond = 0;
     for i in 0..3 {
         let (a, b) = (triangle[i], triangle[(i + 1) % 3]);
-        // Half open: of two edges at a corner one counts.
+        // Half-open: of two edges at a corner one counts.
         if (a[1] > y) == (b[1] > y) {
             continue;
         }
@@ -398,7 +398,7 @@ fn crossing(triangle: &[Corner; 3], x: f64, y: f64) -> Option<(f64, i32)> {
 mod tests {
     use super::*;
 
-    /// Two triangles per side.
+    /// A box with two triangles per side.
     fn block(least: Corner, greatest: Corner) -> Vec<[Corner; 3]> {
         let corner =
             |i: usize| std::array::from_fn(|axis| if i >> axis & 1 == 0 { least[axis] } else { greatest[axis] });
@@ -434,7 +434,7 @@ mod tests {
                     assert_eq!(inside.column(x, y), if expected { vec![[-1.0, 1.0]] } else { Vec::new() });
                 }
             }
-            // Some triangles the other way round: only their number tells.
+            // Some triangles are flipped: only the number of crossings tells.
             triangles[0].swap(0, 1);
             triangles[5].swap(0, 1);
         }
@@ -453,10 +453,10 @@ mod tests {
         triangles.iter().map(|[a, b, c]| [*a, *c, *b]).collect()
     }
 
-    /// What is inside of both, by columns and by points.
+    /// Compares the inside with `expected`, by columns and by points.
     fn agree(inside: &Inside, expected: impl Fn(Corner) -> bool, what: &str) {
         for i in 0..17 * 17 * 17 {
-            // Off the corners and faces, which belong to neither side.
+            // Not on corners and faces, which belong to neither side.
             let at = [i % 17, i / 17 % 17, i / 289].map(|i| f64::from(i) * 0.31 - 0.487);
             assert_eq!(inside.contains(at), expected(at), "{what}: {at:?}");
             let column = inside.column(at[0], at[1]).iter().any(|[low, high]| *low <= at[2] && at[2] <= *high);
@@ -482,10 +482,10 @@ mod tests {
             .collect();
         mixed.extend(one.clone());
         agree(&inside(mixed), |at| within(at, 0.0, 3.0), "both sides, some of them twice");
-        // Some of the triangles are there from both sides.
+        // Some of the triangles occur from both sides.
         let some = [one.clone(), turned(&one[..3])].concat();
         agree(&inside(some), |at| within(at, 0.0, 3.0), "some from both sides");
-        // A room: the walls between two blocks, both from both sides.
+        // A room: the walls between two blocks, with the inner block from both sides.
         let room = [sides, block([1.0; 3], [2.0; 3]), turned(&block([1.0; 3], [2.0; 3]))].concat();
         agree(&inside(room), |at| within(at, 0.0, 3.0) && !within(at, 1.0, 2.0), "a room");
     }
@@ -522,7 +522,7 @@ mod tests {
             let all = [part(0.0, 4.0, is_mirrored), part(0.5, 3.5, !is_mirrored), part(1.5, 2.5, is_mirrored)].concat();
             let expected = |at: Corner| within(at, 0.0, 4.0) && (!within(at, 0.5, 3.5) || within(at, 1.5, 2.5));
             agree(&inside(all), expected, "an island");
-            // What is turned alike is one within the other.
+            // With the same orientation, two nested parts are one solid.
             let nested = [part(0.0, 4.0, is_mirrored), part(0.5, 3.5, is_mirrored)].concat();
             agree(&inside(nested), |at| within(at, 0.0, 4.0), "nested");
         }

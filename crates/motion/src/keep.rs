@@ -1,8 +1,8 @@
-//! What the tool keeps on its way: an axis of it near a direction of the world, its place inside a box. And boxes that everything that moves keeps
-//! out of.
+//! Constraints on the tool along a motion: an axis of it stays near a direction of the world, its position stays in a box. Also boxes that
+//! everything that moves stays out of.
 //!
-//! The free path is searched among postures that keep it (`constrained`). What was timed is looked at once more: the executed curve keeps it
-//! between all samples (`along`), or corners are followed more closely until it does.
+//! The free path is searched among postures that satisfy the constraint (`constrained`). The timed trajectory is checked again: either the
+//! executed curve satisfies the constraint between all samples (`along`), or corners are followed more closely until it does.
 
 use crate::along::first_breach;
 use crate::collision::between;
@@ -19,46 +19,46 @@ use crate::trajectory::Curve;
 use ratn_model::pose::Pose;
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// Vectors that are shorter have no direction.
+/// Shorter vectors have no direction.
 const LEAST_DIRECTION: f64 = 1e-6;
 
-/// The largest box, in metres.
+/// Maximum edge of a box, in metres.
 const MAX_SIZE_M: f64 = 100.0;
 
-/// Parts that each motion of a path is divided into where it is to be followed closely.
+/// Number of parts into which each motion of a path is divided to be followed closely.
 const DIVIDED: usize = 4;
 
 /// An axis of the tool that stays near a direction.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KeptAxis {
-    /// In the frame of the tool, of any length but zero.
+    /// The axis in the tool's frame, of any length but zero.
     pub axis: [f64; 3],
-    /// In the world, of any length but zero; none: where the axis points at the start.
+    /// The direction in the world, of any length but zero; by default the axis's direction at the start.
     pub direction: Option<[f64; 3]>,
-    /// How far it may be off, in radians.
+    /// Maximum angle between the two, in radians.
     pub tolerance_rad: f64,
 }
 
-/// A box in the world: the origin of the tool frame stays in it, or everything that moves stays out of it.
+/// A box in the world: the origin of the tool frame stays inside, or everything that moves stays outside.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Region {
-    /// Its middle and its axes, in the world.
+    /// Its centre and its axes, in the world.
     pub pose: Pose,
     /// Its edges, in metres.
     pub size: [f64; 3],
 }
 
-/// What the tool keeps; nothing unless said.
+/// The constraints on the tool; none by default.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Keep {
-    /// Its direction.
+    /// The constraint on its direction.
     pub axis: Option<KeptAxis>,
-    /// Its place.
+    /// The constraint on its position.
     pub inside: Option<Region>,
 }
 
 impl Region {
-    /// Refuses what makes no sense.
+    /// Refuses values that make no sense.
     pub(crate) fn check(&self, input: &str) -> Result<(), PlanError> {
         let malformed = |part: &str, value: String, expected: String| {
             Err(PlanError::Malformed { what: format!("the {part} of `{input}`"), value, expected })
@@ -76,7 +76,7 @@ impl Region {
 }
 
 impl Keep {
-    /// Refuses what makes no sense.
+    /// Refuses values that make no sense.
     pub(crate) fn check(&self) -> Result<(), PlanError> {
         let malformed = |what: &str, value: String, expected: String| {
             Err(PlanError::Malformed { what: what.to_owned(), value, expected })
@@ -96,7 +96,8 @@ impl Keep {
         self.inside.iter().try_for_each(|region| region.check("inside"))
     }
 
-    /// As a constraint of the frame of a link, from where that frame is at the start, in the frame of the root, which is at `base`.
+    /// The constraint on the frame of a link, for a frame that is at `start` at the beginning. Constraint and `start` are in the root's frame,
+    /// which is at `base` in the world.
     pub fn constraint(&self, mechanism: &Mechanism, link: usize, base: &Pose, start: &Pose) -> Option<Constraint> {
         if *self == Keep::default() {
             return None;
@@ -120,8 +121,8 @@ impl Keep {
     }
 }
 
-/// The trajectory along sections that keeps a constraint all along, as quick as can be; none where even the straight motions from posture
-/// to posture do not keep it. For the rest as [`timed_while`].
+/// The fastest trajectory along sections that satisfies a constraint everywhere; `None` where even the straight motions from posture to posture
+/// violate it. Otherwise as [`timed_while`].
 pub fn timed_keeping(
     joints: &[Joint],
     sections: &[Section],
@@ -139,7 +140,7 @@ pub fn timed_keeping(
     if keeps(&curve) {
         return Some(curve);
     }
-    // Along the postures themselves, then with a stop at each of them.
+    // First through the postures themselves, then with a stop at each of them.
     let closely = |section: &Section| match section {
         Section::Blended(path) => Section::AsGiven(divided(path)),
         given => given.clone(),

@@ -1,4 +1,4 @@
-//! Lines over other postures of the same poses, for arms that have a joint more than a pose needs.
+//! Straight lines by way of other postures of the same poses, for redundant arms (with more joints than a pose needs).
 //!
 //! ```text
 //! rung 0   start ─── its elbow turned ── …
@@ -9,10 +9,10 @@
 //! ```
 //!
 //! The ladder graph of Descartes (Edwards, Lewis, De Gregorio, Meyer: *Descartes, a path-planning library for semi-constrained Cartesian trajectories*,
-//! 2015): a rung for every few centimetres of the line with postures all over the redundancy, and steps between postures that are close to
-//! each other, on one rung (the tool stands while the elbow turns) or to the next (both at once). The quickest way up is looked for; its steps
-//! are followed finely only then, and what fails is left out of the next search. The way that is found is evened out, so that the arm
-//! does not stop at each rung. Everything is bounded; no randomness. It does not look for another first posture.
+//! 2015): a rung for every few centimetres of the line, with postures from the whole redundancy, and steps between postures that are close to each
+//! other, on one rung (the tool stands while the elbow turns) or to the next (both at once). The fastest way up is searched; its steps are checked
+//! finely only then, and failing steps are excluded from the next search. The way is smoothed afterwards, so that the arm does not stop at each rung.
+//! Everything is bounded and deterministic. No other start posture is tried.
 
 use crate::joint_vector::JointVector;
 use crate::line::{self, Cause, FINEST, Lines, MAX_JUMP, MAX_STEPS, STRAY_M, Traced};
@@ -22,35 +22,35 @@ use ratn_model::pose::Pose;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap};
 
-/// The line is cut into rungs of at most so many steps of a line (2 cm, or 5 degrees).
+/// Maximum number of line steps per rung (2 cm, or 5 degrees).
 const STEPS_PER_RUNG: usize = 8;
 
-/// Lines with more rungs are not tried: 8 m.
+/// Maximum number of rungs: 8 m.
 const MAX_RUNGS: usize = 400;
 
-/// The most postures on a ladder.
+/// Maximum number of postures on a ladder.
 const MAX_POSTURES: usize = 60_000;
 
-/// A joint moves at most so far in a step between postures of the ladder, in radians or metres.
+/// Maximum joint motion in a step between postures of the ladder, in radians or metres.
 const MAX_STEP: f64 = 0.6;
 
-/// So often a way is looked for after one had a step that fails.
+/// Maximum number of further searches after a step has failed.
 const REPAIRS: usize = 48;
 
-/// Postures from which steps are looked for at most, in all searches for one line together.
+/// Maximum number of expanded postures, in all searches for one line together.
 const MAX_VISITS: usize = 100_000;
 
-/// How often a way is evened out, in the order in which it is tried.
+/// Numbers of smoothing passes that are tried, in this order.
 const EVENINGS: [usize; 4] = [60, 12, 3, 0];
 
-/// How much all joints turn together from one fine posture to the next: the tool is turned beside the line by an eighth of the square of that at
-/// the most, half a milliradian.
+/// Maximum joint motion, over all joints, from one fine posture to the next. The tool deviates in rotation from the line by at most an eighth of its
+/// square, half a milliradian.
 const MOST_TURNS_RAD: f64 = 0.063;
 
-/// A way is searched in whole numbers: this much of a second.
+/// Costs of the search are integers, in units of this time in seconds.
 const TICK_S: f64 = 1e-5;
 
-/// One rung of the ladder: what of a piece leads to it.
+/// A rung of the ladder, with the part of a piece that leads to it.
 #[derive(Debug, Clone, Copy)]
 struct Rung {
     piece: usize,
@@ -58,27 +58,27 @@ struct Rung {
     to: f64,
 }
 
-/// A posture by its rung (0: the start of the line) and its place there.
+/// A posture by its rung (0: the start of the line) and its index there.
 type Node = (usize, usize);
 
 struct Ladder<'l> {
     reach: &'l Reach,
     lines: &'l Lines,
     rungs: Vec<Rung>,
-    /// Rung by rung, as far as they were needed.
+    /// Postures by rung, as far as they were needed.
     postures: Vec<Vec<JointVector>>,
     count: usize,
     visits: usize,
-    /// Whether the postures are free that were looked at.
+    /// Whether the postures that were checked are free.
     free: BTreeMap<Node, bool>,
     failed: BTreeSet<(Node, Node)>,
     followed: BTreeSet<(Node, Node)>,
 }
 
-/// A way along lines from `start`, whose joints move straight between its postures where `is_free` says so; none where none is found.
+/// A path along lines from `start`, whose joints move straight between its postures where `is_free` allows it; `None` where none is found.
 ///
 /// # Errors
-/// What `control` said, when that was not to go on.
+/// What `control` returned, where that ends the search.
 pub(crate) fn climb(
     reach: &Reach,
     lines: &Lines,
@@ -130,7 +130,7 @@ fn rungs(lines: &Lines) -> Vec<Rung> {
 }
 
 impl Ladder<'_> {
-    /// The quickest way from the start to the last rung, of steps that have not failed.
+    /// The fastest way from the start to the last rung, without steps that have failed.
     fn quickest(
         &mut self,
         is_free: &mut dyn FnMut(&JointVector, &JointVector) -> bool,
@@ -185,7 +185,7 @@ impl Ladder<'_> {
         Ok(None)
     }
 
-    /// Makes room for what is known of the nodes up to a rung.
+    /// Makes room for the search data of the nodes up to a rung.
     fn grow(&self, costs: &mut Vec<Vec<u64>>, before: &mut Vec<Vec<Node>>, to: Node) {
         for rung in costs.len()..=to.0 {
             costs.push(vec![u64::MAX; self.postures[rung].len()]);
@@ -193,7 +193,7 @@ impl Ladder<'_> {
         }
     }
 
-    /// Makes the postures of a rung; whether there is room for them.
+    /// Computes the postures of a rung; returns whether the total is within the limit.
     fn make(&mut self, rung: usize) -> bool {
         if rung == self.postures.len() {
             let Rung { piece, to, .. } = self.rungs[rung - 1];
@@ -205,7 +205,7 @@ impl Ladder<'_> {
         self.count <= MAX_POSTURES
     }
 
-    /// How far it is between two postures, in ticks of the joints' full speeds; none where a joint goes too far for a step.
+    /// Cost of a step between two postures, in ticks at the joints' full speeds; `None` where a joint moves too far for a step.
     fn lasts(&self, from: &JointVector, to: &JointVector) -> Option<u64> {
         let mut square = 0.0;
         for (j, joint) in self.reach.limits().iter().enumerate() {
@@ -218,7 +218,7 @@ impl Ladder<'_> {
         Some((square.sqrt() / TICK_S).ceil() as u64 + 1)
     }
 
-    /// Follows the steps of a way that were not followed yet; whether all of them can be. One that cannot is not taken again.
+    /// Checks the steps of a way that were not checked yet; returns whether all succeed. A failing step is not used again.
     fn test(
         &mut self,
         way: &[Node],
@@ -242,7 +242,7 @@ impl Ladder<'_> {
         Ok(true)
     }
 
-    /// The way with its postures evened out as far as it can still be followed, finely.
+    /// The way with its postures smoothed as far as it can still be followed, in fine steps.
     fn even(
         &self,
         way: &[Node],
@@ -268,7 +268,7 @@ impl Ladder<'_> {
         Ok(None)
     }
 
-    /// Postures close to each other along a way, whose rungs have these postures.
+    /// Fine postures along a way whose rungs have the given postures.
     fn traced(
         &self,
         way: &[Node],
@@ -295,7 +295,7 @@ impl Ladder<'_> {
         Ok(Some(traced))
     }
 
-    /// One step of a way in fine steps: the tool on the line, the joints as close as that allows to a cubic from end to end.
+    /// One step of a way in fine steps: the tool on the line, the joints as close as possible to a cubic between the ends.
     fn follow(
         &self,
         step: &Step,
@@ -348,7 +348,7 @@ impl Ladder<'_> {
         self.lines.pieces[piece].at(share)
     }
 
-    /// Where on which piece a rung is.
+    /// The piece of a rung, and the share of it.
     fn place(&self, rung: usize) -> (usize, f64) {
         match rung.checked_sub(1) {
             None => (self.rungs[0].piece, self.rungs[0].from),
@@ -357,11 +357,11 @@ impl Ladder<'_> {
     }
 }
 
-/// From a posture to another, on one rung or to the next.
+/// A step from one posture to another, on one rung or to the next.
 struct Step {
     rungs: [usize; 2],
     ends: [JointVector; 2],
-    /// How the joints go at the ends, per step.
+    /// Derivatives of the joints at the ends, per step.
     tangents: [JointVector; 2],
 }
 
@@ -373,7 +373,7 @@ struct Fine {
 }
 
 impl Step {
-    /// The cubic of Hermite.
+    /// A cubic Hermite polynomial.
     fn at(&self, share: f64) -> JointVector {
         let [(a, b), (u, v)] = [(&self.ends[0], &self.ends[1]), (&self.tangents[0], &self.tangents[1])];
         let (s, t) = (share, 1.0 - share);
@@ -382,14 +382,14 @@ impl Step {
         })
     }
 
-    /// The joints go evenly.
+    /// The joints move linearly.
     fn straight(rungs: [usize; 2], ends: [JointVector; 2]) -> Step {
         let way = JointVector::from_fn(ends[0].len(), |j| ends[1][j] - ends[0][j]);
         Step { rungs, ends, tangents: [way; 2] }
     }
 }
 
-/// Half of the way from the posture before to the posture after each; at the ends the way to the next.
+/// Half the difference between the postures before and after each; at the ends the difference to the neighbour.
 fn tangents(postures: &[JointVector]) -> Vec<JointVector> {
     let last = postures.len() - 1;
     let tangent = |k: usize| {

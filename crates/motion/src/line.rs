@@ -1,10 +1,10 @@
-//! The tool along straight lines from pose to pose: its position along the segment, its rotation by the shortest turn, both evenly; corners
-//! sharp or rounded.
+//! Moves the tool along straight lines from pose to pose: its position along the segment, its rotation by the shortest turn, both evenly; corners are sharp or
+//! rounded.
 //!
-//! The arm is solved at postures a few millimetres apart (closer together where the joints go far), each from the one before. The tool is exactly
-//! on the line there; where the joints go straight from one of them to the next it is at most [`STRAY_M`] beside the line, which is bounded and not sampled (`levers`).
-//! Where that ends early and the arm has a joint more than a pose needs, other postures of the same poses are tried (`ladder`). All or
-//! an error, which says how far the nearest postures get and which joint ends the line. Any robot.
+//! The inverse kinematics are solved a few millimetres apart (closer where joints move far), each posture from the one before. There the tool is exactly on the
+//! line; where the joints move straight between two postures it is at most [`STRAY_M`] beside it, which is bounded analytically, not sampled (`levers`). Where
+//! that ends early and the arm is redundant, other postures of the same poses are tried (`ladder`). The result is the whole line or an error, which says how
+//! far the nearest postures get and which joint ends the line. Works for any robot.
 
 use crate::frame::{compose, difference, norm};
 use crate::joint_vector::JointVector;
@@ -15,38 +15,38 @@ use crate::robot_model::Joint;
 use ratn_model::pose::Pose;
 use std::fmt;
 
-/// How far the tool may be beside the line between two solved postures, in metres.
+/// Maximum distance of the tool from the line between two solved postures, in metres.
 pub const STRAY_M: f64 = 2.5e-4;
 
-/// The tool's way and turn between two solved postures, in metres and radians.
+/// Maximum distance and rotation of the tool between two solved postures, in metres and radians.
 pub(crate) const STEP_M: f64 = 0.0025;
 pub(crate) const STEP_RAD: f64 = 0.01;
 
-/// Where the joints go far, steps are halved down to this part of one.
+/// Where joints move far, steps are halved down to this part of one.
 pub(crate) const FINEST: f64 = 1.0 / 16.0;
 
-/// The most solved postures of one motion.
+/// Maximum number of solved postures in one motion.
 pub(crate) const MAX_STEPS: usize = 16_000;
 
-/// Solved postures of a rounded corner at the least: so many that none of them is a kink at which the arm would stop.
+/// Minimum number of solved postures in a rounded corner: so many that none of them is a kink at which the arm would stop.
 const CORNER_STEPS: usize = 48;
 
-/// A joint that moves more than this between two solved postures jumps to another branch, in radians or metres.
+/// A joint that moves more than this between two solved postures jumps to another solution branch, in radians or metres.
 pub(crate) const MAX_JUMP: f64 = 0.1;
 
-/// A joint this close to a limit is taken as held by it, in radians or metres.
+/// A joint this close to a limit counts as being at the limit, in radians or metres.
 const AT_LIMIT: f64 = 0.01;
 
-/// The control points of a rounded corner on each side, from its end to the corner: the curve has no bend where it begins and ends.
+/// The control points of a rounded corner on each side, from its end to the corner: the curvature is zero at both ends.
 const CONTROLS: [f64; 3] = [0.0, 0.4, 0.8];
 
-/// A straight line that the arm cannot follow to its end.
+/// The arm cannot follow a straight line to its end.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("the arm can follow the straight line for only {reached_m:.3} m of {wanted_m:.3} m: {cause}")]
 pub struct LineError {
-    /// How far it gets, in metres.
+    /// The length that the arm can follow, in metres.
     pub reached_m: f64,
-    /// How far it should, in metres.
+    /// The length of the line, in metres.
     pub wanted_m: f64,
     /// What ends the line.
     pub cause: Cause,
@@ -55,23 +55,23 @@ pub struct LineError {
 /// What ends a line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Cause {
-    /// A joint cannot turn further.
+    /// A joint is at its limit.
     Limit {
-        /// Which joint.
+        /// The joint.
         joint: String,
     },
-    /// No posture leads on: the arm is stretched, or all of it would have to turn.
+    /// No posture continues the line: the arm is stretched, or would have to change its whole posture.
     OutOfReach,
-    /// A joint would have to turn at once by far more than the tool moves.
+    /// A joint would have to move much farther than the tool.
     Flip {
-        /// Which joint.
+        /// The joint.
         joint: String,
     },
-    /// More postures than are solved for one motion.
+    /// The line needs more postures than one motion may have.
     TooLong,
     /// Something is in the way.
     Blocked {
-        /// What it is.
+        /// The obstacle.
         reason: String,
     },
 }
@@ -91,15 +91,15 @@ impl fmt::Display for Cause {
 /// Postures along straight lines, as far as the arm gets.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Traced {
-    /// The first is where it starts.
+    /// The first posture is the start.
     pub postures: Vec<JointVector>,
-    /// How far the tool has come at each of them, in metres.
+    /// The tool's distance along the lines at each posture, in metres.
     pub along_m: Vec<f64>,
-    /// Which pose each of them leads to, by its index.
+    /// For each posture, the index of the pose that it leads to.
     pub towards: Vec<usize>,
     /// The length of all lines, in metres.
     pub wanted_m: f64,
-    /// Which pose they were last on the way to.
+    /// Index of the pose that the last posture was leading to.
     pub whither: usize,
     /// What ends the lines early.
     pub ended: Option<Cause>,
@@ -111,7 +111,7 @@ impl Traced {
         Traced { postures: vec![*start], along_m: vec![0.0], towards: vec![0], wanted_m, whither: 0, ended: None }
     }
 
-    /// The postures, where they lead to the end of the lines.
+    /// The postures, if they reach the end of the lines.
     pub(crate) fn whole(self) -> Result<Vec<JointVector>, LineError> {
         match self.ended {
             None => Ok(self.postures),
@@ -122,7 +122,7 @@ impl Traced {
         }
     }
 
-    /// One more posture, at a share of a piece.
+    /// Adds a posture, at a share of a piece.
     pub(crate) fn push(&mut self, posture: JointVector, lines: &Lines, piece: usize, share: f64) {
         let before_m: f64 = lines.pieces[..piece].iter().map(|piece| piece.length_m).sum();
         self.postures.push(posture);
@@ -131,8 +131,8 @@ impl Traced {
     }
 }
 
-/// Postures along the straight line of the frame of `reach` from where it is in the posture `start` to a pose (in the frame of the root);
-/// the first is `start`.
+/// Postures along the straight line that takes the frame of `reach` from its pose in the posture `start` to another pose (in the root's frame); the first is
+/// `start`.
 ///
 /// # Errors
 /// [`LineError`] where limits or a singular posture end the line early.
@@ -140,31 +140,31 @@ pub fn line(reach: &Reach, start: &JointVector, to: &Pose) -> Result<Vec<JointVe
     through(reach, start, &[*to], 0.0).whole()
 }
 
-/// As [`line()`] of the nearest postures alone: each is solved from the one before.
+/// As [`line()`], using only the nearest postures: each is solved from the one before.
 ///
 /// # Errors
 /// [`LineError`] where limits or a singular posture end the line early.
 pub fn line_of_nearest(reach: &Reach, start: &JointVector, to: &Pose) -> Result<Vec<JointVector>, LineError> {
     let lines = Lines::new(reach.pose(start), &[*to], 0.0);
     let traced = nearest(reach, &lines, start, &mut |_, _| Ok(()), &mut || Control::Continue);
-    // It is never told to stop.
+    // `control` never stops it.
     traced.unwrap_or_else(|_| Traced::beginning(&lines, start)).whole()
 }
 
-/// Postures along straight lines from where the frame of `reach` is in the posture `start` through poses (in the frame of the root), as far as
-/// the arm gets. At each pose but the last the tool may leave the lines as far as `blend_m` from it.
+/// Postures along straight lines that take the frame of `reach` from its pose in the posture `start` through poses (in the root's frame), as far as the arm
+/// gets. At each pose but the last the tool may deviate from the lines within `blend_m` of the pose.
 pub fn through(reach: &Reach, start: &JointVector, to: &[Pose], blend_m: f64) -> Traced {
     let lines = Lines::new(reach.pose(start), to, blend_m);
     let traced = trace(reach, &lines, start, &mut |_, _| Ok(()), &mut || Control::Continue);
-    // It is never told to stop.
+    // `control` never stops it.
     traced.unwrap_or_else(|_| Traced::beginning(&lines, start))
 }
 
-/// Postures along lines: each solved from the one before, or over other postures of the same poses where that way ends or is not free.
-/// `is_free` says what is in the way of a straight motion of the joints; `control` is asked between the postures.
+/// Postures along lines: each solved from the one before, or, where that ends or is blocked, by way of other postures of the same poses. `is_free` says what
+/// blocks a straight motion of the joints; `control` is asked between the postures.
 ///
 /// # Errors
-/// What `control` said, when that was not to go on.
+/// What `control` returned, where that ends the planning.
 pub(crate) fn trace(
     reach: &Reach,
     lines: &Lines,
@@ -180,7 +180,7 @@ pub(crate) fn trace(
     Ok(other.unwrap_or(nearest))
 }
 
-/// Each posture solved from the one before.
+/// Solves each posture from the one before.
 pub(crate) fn nearest(
     reach: &Reach,
     lines: &Lines,
@@ -206,7 +206,7 @@ pub(crate) fn nearest(
                 return Err(answer.into());
             }
             let share = |part: f64| (i as f64 - 1.0 + part) / steps as f64;
-            // Near a singular posture the joints go far while the tool hardly moves: there the postures are closer together.
+            // Near a singular posture the joints move far while the tool hardly moves: there the postures are closer together.
             let (mut done, mut part) = (0.0, 1.0);
             while done < 1.0 {
                 let here = traced.postures[traced.postures.len() - 1];
@@ -231,7 +231,7 @@ pub(crate) fn nearest(
     Ok(traced)
 }
 
-/// From one posture to the next on a line: the one that a descent from `seed` finds.
+/// The next posture on a line: the one that a descent from `seed` finds.
 pub(crate) fn step(reach: &Reach, here: &JointVector, seed: &JointVector, to: &Pose) -> Result<JointVector, Cause> {
     let joints = reach.limits();
     let Some(next) = reach.descend(&Target::at(*to), seed) else {
@@ -247,7 +247,7 @@ pub(crate) fn step(reach: &Reach, here: &JointVector, seed: &JointVector, to: &P
     Ok(next)
 }
 
-/// Lines from pose to pose with their corners, piece after piece.
+/// Lines from pose to pose with their corners, as a sequence of pieces.
 #[derive(Debug, Clone)]
 pub(crate) struct Lines {
     pub(crate) pieces: Vec<Piece>,
@@ -257,7 +257,7 @@ pub(crate) struct Lines {
 #[derive(Debug, Clone)]
 pub(crate) struct Piece {
     curve: Curve,
-    /// Of a corner at the most.
+    /// For a corner an upper bound.
     length_m: f64,
     turn_rad: f64,
     /// The index of the pose that it leads to.
@@ -273,8 +273,8 @@ enum Curve {
 }
 
 impl Lines {
-    /// From a pose through others to the last of them. At each but the last the tool may leave the lines as far as `blend_m` from it, and no
-    /// further than the middle of either line.
+    /// Lines from a pose through others to the last of them. At each but the last the tool may deviate from the lines within `blend_m` of the pose, and not
+    /// beyond the middle of either line.
     pub(crate) fn new(from: Pose, to: &[Pose], blend_m: f64) -> Lines {
         let starts = std::iter::once(&from).chain(to);
         let legs: Vec<Leg> = starts.zip(to).map(|(from, to)| Leg::new(*from, *to)).collect();
@@ -283,7 +283,7 @@ impl Lines {
         for (i, leg) in legs.iter().enumerate() {
             let next = legs.get(i + 1);
             let radius = next.map_or(0.0, |next| blend_m.min(leg.length_m() / 2.0).min(next.length_m() / 2.0));
-            // Less would be no corner that the arm can pass any faster.
+            // A smaller corner would not be faster.
             let radius = if radius < STEP_M { 0.0 } else { radius };
             let ends = if radius > 0.0 { 1.0 - radius / leg.length_m() } else { 1.0 };
             if ends > begins {
@@ -306,20 +306,20 @@ impl Lines {
         Lines { pieces }
     }
 
-    /// Whether they would take more postures than one motion may have, of whatever arm.
+    /// Whether they need more postures than one motion may have, for any arm.
     pub(crate) fn is_too_long(&self) -> bool {
         self.pieces.iter().fold(1, |sum: usize, piece| sum.saturating_add(piece.steps())) > MAX_STEPS
     }
 }
 
 impl Piece {
-    /// Into how many steps it is cut where the joints do not go far.
+    /// Number of steps where the joints do not move far.
     pub(crate) fn steps(&self) -> usize {
         let steps = (self.length_m / STEP_M).max(self.turn_rad / STEP_RAD).ceil() as usize;
         steps.max(if matches!(self.curve, Curve::Corner(_)) { CORNER_STEPS } else { 1 })
     }
 
-    /// The pose at a share of it.
+    /// The pose at a share of the piece.
     pub(crate) fn at(&self, share: f64) -> Pose {
         self.curve.at(share)
     }
@@ -347,7 +347,7 @@ impl Curve {
 struct Leg {
     from: Pose,
     way: [f64; 3],
-    /// Rotation vector.
+    /// A rotation vector.
     turn: [f64; 3],
 }
 
@@ -365,7 +365,7 @@ impl Leg {
         norm(self.turn)
     }
 
-    /// The pose at a share of the way.
+    /// The pose at a share of the line.
     fn at(&self, share: f64) -> Pose {
         let turned = compose(&turned_by(self.turn.map(|c| c * share)), &self.from);
         Pose { position: std::array::from_fn(|i| self.from.position[i] + share * self.way[i]), ..turned }
@@ -375,7 +375,7 @@ impl Leg {
 /// The rotation by a rotation vector.
 fn turned_by(vector: [f64; 3]) -> Pose {
     let angle = norm(vector);
-    // Near zero the sine of half of the angle is half of the angle.
+    // Near zero the sine of half the angle is about half the angle.
     let scale = if angle > 1e-9 { (angle / 2.0).sin() / angle } else { 0.5 };
     let [x, y, z] = vector.map(|c| c * scale);
     Pose { position: [0.0; 3], quaternion_xyzw: [x, y, z, (angle / 2.0).cos()] }

@@ -1,5 +1,5 @@
-//! Triangle meshes as collision shapes: read from STL, OBJ and Collada, and held by spheres (`mesh_cover`). Files are found and read by
-//! `mesh_files` or by whoever uses the crate.
+//! Triangle meshes as collision shapes: read from STL, OBJ and Collada, and covered by spheres (`mesh_cover`). Files are found and read
+//! by `mesh_files` or by the user of the crate.
 
 use crate::frame::norm;
 use crate::inside::Inside;
@@ -10,68 +10,68 @@ use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
 use std::sync::{Arc, OnceLock};
 
-/// Triangles of a mesh at the most.
+/// Maximum number of triangles in a mesh.
 pub const MAX_TRIANGLES: usize = 1_000_000;
 
-/// Why there is no mesh.
+/// Why a mesh cannot be made.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum MeshError {
-    /// Of another kind.
+    /// The format is not supported.
     #[error("only STL, OBJ and Collada (.dae) meshes are supported; convert it")]
     Kind,
-    /// Something in a file of text that cannot be read.
+    /// A text file has an error.
     #[error("line {line}: {reason}")]
     Text {
-        /// Counted from 1.
+        /// Line number, from 1.
         line: usize,
         /// What is wrong.
         reason: String,
     },
-    /// It ends too early, or has no triangles, or too many.
+    /// The file ends too early, or has no triangles or too many.
     #[error("{triangles} triangles announced, {bytes} bytes there: expected 1 to {MAX_TRIANGLES} whole triangles")]
     Triangles {
-        /// As the file says.
+        /// Number of triangles according to the file.
         triangles: usize,
-        /// How long the file is.
+        /// Length of the file.
         bytes: usize,
     },
     /// No triangles, or too many.
     #[error("it has {triangles} triangles: expected 1 to {MAX_TRIANGLES}; simplify it")]
     Count {
-        /// How many.
+        /// Their number.
         triangles: usize,
     },
-    /// A text that is no STL.
+    /// A text is not valid STL.
     #[error("line {line} is no vertex of three numbers, or comes too early or too late for a triangle")]
     Line {
-        /// Counted from 1.
+        /// Line number, from 1.
         line: usize,
     },
-    /// A scale that leaves no volume.
+    /// The scale is zero or not finite.
     #[error("its scale is {scale:?}: each number is finite and not zero; a negative one mirrors")]
     Scale {
-        /// Along x, y, z.
+        /// Scale along x, y, z.
         scale: [f64; 3],
     },
-    /// So large that its numbers are hardly metres.
+    /// The mesh is so large that its numbers are hardly in metres.
     #[error(
         "it is {extent_m:.0} m long: where its numbers are millimetres, give it `scale=\"0.001 0.001 0.001\"`; where it is as large as that, \
          `scale=\"1 1 1\"`"
     )]
     Large {
-        /// Along the longest side of the box that holds it, in metres.
+        /// Longest side of its bounding box, in metres.
         extent_m: f64,
     },
-    /// Not finite.
+    /// A corner is not finite or too far away.
     #[error("a corner of triangle {triangle} is not finite, or it is beyond a kilometre")]
     NotFinite {
-        /// Counted from 0.
+        /// Index of the triangle, from 0.
         triangle: usize,
     },
-    /// It cannot be read.
+    /// The file cannot be read.
     #[error("cannot be read: {reason}")]
     Read {
-        /// Why not.
+        /// The reason.
         reason: String,
     },
 }
@@ -80,9 +80,9 @@ pub enum MeshError {
 #[derive(Debug, Clone)]
 pub struct Mesh {
     triangles: Vec<[[f64; 3]; 3]>,
-    /// As the exact checks want it, made when it is first asked for.
+    /// Surface and inside for the exact checks, computed when first needed.
     solid: OnceLock<(SharedShape, Arc<Inside>)>,
-    /// Spheres that hold it, made when they are first asked for.
+    /// Spheres that cover it, computed when first needed.
     cover: OnceLock<Vec<Sphere>>,
 }
 
@@ -95,7 +95,7 @@ impl PartialEq for Mesh {
 /// Red, green and blue, each from 0 to 1.
 pub type Colour = [f64; 3];
 
-/// Triangles of a file that follow each other and have one colour, if the file says which.
+/// Consecutive triangles of a file that have one colour, if the file gives one.
 pub(crate) struct Part {
     pub(crate) colour: Option<Colour>,
     pub(crate) triangles: Vec<[[f64; 3]; 3]>,
@@ -104,9 +104,9 @@ pub(crate) struct Part {
 /// A mesh fixed to a link.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Meshed {
-    /// In the link's frame.
+    /// Its pose in the link's frame.
     pub pose: Pose,
-    /// What it is.
+    /// The mesh.
     pub mesh: Arc<Mesh>,
 }
 
@@ -114,7 +114,7 @@ impl Mesh {
     /// A mesh of triangles, in metres.
     ///
     /// # Errors
-    /// [`MeshError`] where there are none, too many, or one that is not finite.
+    /// [`MeshError`] where there are no triangles, too many, or one that is not finite.
     pub fn new(triangles: Vec<[[f64; 3]; 3]>) -> Result<Mesh, MeshError> {
         if triangles.is_empty() || triangles.len() > MAX_TRIANGLES {
             return Err(MeshError::Count { triangles: triangles.len() });
@@ -126,16 +126,16 @@ impl Mesh {
         }
     }
 
-    /// Triangles of a mesh, or some of them, that were moved.
+    /// Makes a mesh of triangles of another mesh, moved or selected.
     pub(crate) fn placed(triangles: Vec<[[f64; 3]; 3]>) -> Mesh {
         Mesh { triangles, solid: OnceLock::new(), cover: OnceLock::new() }
     }
 
-    /// Reads a file, by the end of its name: `.stl`, `.obj` or `.dae`; its numbers are multiplied by `scale` along x, y, z to be metres.
-    /// Where a scale mirrors, triangles are turned, so that the same side is outside.
+    /// Reads a file by its extension: `.stl`, `.obj` or `.dae`; `scale` converts its numbers along x, y, z to metres. Where a scale
+    /// mirrors, the order of corners is reversed, so that the same side is outside.
     ///
     /// # Errors
-    /// [`MeshError`] says what is wrong with it.
+    /// [`MeshError`] names the problem.
     pub fn read(name: &str, bytes: &[u8], scale: [f64; 3]) -> Result<Mesh, MeshError> {
         let mut triangles = Vec::new();
         for mut part in Mesh::parts(name, bytes, scale, &mut |_| None)? {
@@ -144,7 +144,8 @@ impl Mesh {
         Mesh::new(triangles)
     }
 
-    /// Reads a file, as [`Mesh::read`], with its colours; in the order of the file. `beside` gives what is in a file that it names.
+    /// Reads a file, as [`Mesh::read`], with its colours; in the order of the file. `beside` returns the content of a file that it
+    /// refers to.
     pub(crate) fn parts(
         name: &str,
         bytes: &[u8],
@@ -175,36 +176,36 @@ impl Mesh {
     /// Reads an STL, as [`Mesh::read`].
     ///
     /// # Errors
-    /// [`MeshError`] says what is wrong with it.
+    /// [`MeshError`] names the problem.
     pub fn stl(bytes: &[u8], scale: [f64; 3]) -> Result<Mesh, MeshError> {
         Mesh::read(".stl", bytes, scale)
     }
 
-    /// Corners of the triangles.
+    /// The corners of the triangles.
     pub fn triangles(&self) -> &[[[f64; 3]; 3]] {
         &self.triangles
     }
 
-    /// The shape for parry3d: the surface.
+    /// The surface as a shape for parry3d.
     pub(crate) fn shape(&self) -> SharedShape {
         let corners = self.triangles.iter().flatten().map(|[x, y, z]| Vector::new(*x as f32, *y as f32, *z as f32));
         let indices = (0..self.triangles.len() as u32).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
         let ball = || SharedShape::ball(0.0);
-        // It refuses meshes without triangles only, and there are none.
+        // parry3d only refuses a mesh without triangles, which does not exist.
         SharedShape::trimesh(corners.collect(), indices).unwrap_or_else(|_| ball())
     }
 
-    /// The surface, for parry3d; the same one whenever it is asked for.
+    /// The surface, for parry3d; shared by all calls.
     pub fn surface(&self) -> SharedShape {
         self.solid().0
     }
 
-    /// The surface and the inside; the same ones whenever it is asked for.
+    /// The surface and the inside; shared by all calls.
     pub(crate) fn solid(&self) -> (SharedShape, Arc<Inside>) {
         self.solid.get_or_init(|| (self.shape(), Arc::new(Inside::new(self)))).clone()
     }
 
-    /// The longest side of the box along its axes that holds it, in metres.
+    /// The longest side of its axis-aligned bounding box, in metres.
     pub(crate) fn extent_m(&self) -> f64 {
         let corners = || self.triangles.iter().flatten();
         let along = |i: usize| {
@@ -214,12 +215,12 @@ impl Mesh {
         (0..3).map(along).fold(0.0, f64::max)
     }
 
-    /// The farthest of its corners from its origin.
+    /// The greatest distance of a corner from the origin.
     pub(crate) fn radius(&self) -> f64 {
         self.triangles.iter().flatten().map(|corner| norm(*corner)).fold(0.0, f64::max)
     }
 
-    /// Spheres that hold it, `padding` metres larger.
+    /// Spheres that cover it, `padding` metres larger.
     pub fn cover(&self, padding: f64) -> Vec<Sphere> {
         let spheres = self.cover.get_or_init(|| mesh_cover::cover(&self.triangles));
         spheres.iter().map(|sphere| Sphere { radius: sphere.radius + padding.max(0.0), ..*sphere }).collect()
@@ -227,7 +228,7 @@ impl Mesh {
 }
 
 impl Meshed {
-    /// Spheres, in the link's frame, that hold it and `padding` metres around.
+    /// Spheres in the link's frame that cover it, `padding` metres larger.
     pub fn cover(&self, padding: f64) -> Vec<Sphere> {
         let spheres = self.mesh.cover(padding).into_iter();
         spheres.map(|s| Sphere { centre: self.pose.transform(s.centre), ..s }).collect()

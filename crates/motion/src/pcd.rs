@@ -1,16 +1,16 @@
-//! Reading PCD, the point clouds of PCL: as text, binary, or binary and compressed; `x`, `y` and `z` wherever they stand in `FIELDS`.
+//! Reads PCD, the point clouds of PCL: text, binary, or compressed binary; `x`, `y` and `z` may be anywhere in `FIELDS`.
 //!
-//! The `VIEWPOINT` says where the camera was and moves nothing, as in PCL. Compressed files hold one field after the other, packed by LZF
+//! The `VIEWPOINT` gives the camera's pose and is not applied, as in PCL. Compressed files store one field after the other, packed by LZF
 //! (Marc Lehmann's LibLZF).
 
 use crate::cloud::MAX_POINTS;
 use crate::point_files::{Lines, PointsError};
 use crate::scalar::Scalar;
 
-/// Bytes that a compressed file may hold unpacked.
+/// Maximum unpacked bytes of a compressed file.
 const MOST_UNPACKED: usize = 512 << 20;
 
-/// What a header says; empty or `None` where it does not.
+/// The content of a header; empty or `None` where it has no such line.
 #[derive(Debug, Default)]
 struct Header {
     fields: Vec<String>,
@@ -27,11 +27,11 @@ struct Header {
 struct Axis {
     /// The index of its field,
     field: usize,
-    /// and how that is stored, in binary.
+    /// and its binary format.
     kind: Option<Scalar>,
 }
 
-/// The points of a file; coordinates may be not finite.
+/// The points of a file; coordinates may be non-finite.
 pub(crate) fn points(bytes: &[u8]) -> Result<Vec<[f64; 3]>, PointsError> {
     let mut lines = Lines::new(bytes);
     let mut header = Header::default();
@@ -56,7 +56,7 @@ pub(crate) fn points(bytes: &[u8]) -> Result<Vec<[f64; 3]>, PointsError> {
 }
 
 impl Header {
-    /// Takes a line; the one of `DATA` is the last, and gives what kind of data follows.
+    /// Parses a header line; the `DATA` line is the last, and returns the kind of data that follows.
     fn take(&mut self, text: &str) -> Result<Option<String>, String> {
         let mut words = text.split_whitespace();
         let key = words.next().unwrap_or("");
@@ -81,7 +81,7 @@ impl Header {
         Ok(None)
     }
 
-    /// How many points there are.
+    /// Number of points.
     fn count(&self) -> Result<usize, String> {
         let grid = self.width.zip(self.height).map(|(width, height)| width.saturating_mul(height));
         let count = match (self.points, grid) {
@@ -114,7 +114,7 @@ impl Header {
         Ok(axes)
     }
 
-    /// Numbers of a field in each point.
+    /// Count of numbers in a field of each point.
     fn each(&self, field: usize) -> usize {
         self.counts.get(field).copied().unwrap_or(1)
     }
@@ -129,7 +129,7 @@ impl Header {
         }
     }
 
-    /// Where each field begins in a record, and the length of all; `None` where that is beyond all measure.
+    /// The offset of each field in a record, and the record's length; `None` on overflow.
     fn offsets(&self) -> Option<Vec<usize>> {
         let mut offsets = vec![0_usize];
         for field in 0..self.fields.len() {
@@ -209,7 +209,7 @@ impl Header {
         numbers(&columns, begin, count, axes, at)
     }
 
-    /// Where fields begin, the length of a record and of all, in bytes.
+    /// The offsets of fields, the length of a record and of all records, in bytes.
     fn layout(&self, first: usize, count: usize) -> Result<(Vec<usize>, usize, usize), PointsError> {
         let offsets = self.offsets();
         let record = offsets.as_ref().and_then(|offsets| offsets.last().copied());
@@ -240,11 +240,11 @@ fn numbers(
     (0..count).map(|point| Ok([number(point, x)?, number(point, y)?, number(point, z)?])).collect()
 }
 
-/// Unpacks LZF to a length that is known. A byte below 32 says how many bytes follow as they are, one more than that; another one has the
-/// length of what is repeated in its upper three bits (7: the next byte adds to it) and from how far back in the others and the next byte.
+/// Unpacks LZF data of known unpacked length. A control byte n below 32 is followed by n + 1 literal bytes. Any other control byte is a
+/// back reference: its upper three bits are the length (7: the next byte is added), its lower five bits and the next byte the distance.
 ///
 /// # Errors
-/// Where the data are damaged.
+/// Where the data are damaged: the byte offset.
 fn unpack(packed: &[u8], length: usize) -> Result<Vec<u8>, usize> {
     let mut out: Vec<u8> = Vec::new();
     let mut at = 0;

@@ -1,6 +1,6 @@
-//! Reading the points of PLY files, as text or binary: `x`, `y` and `z` of the element `vertex`, wherever they stand in it.
+//! Reads the points of PLY files, text or binary: `x`, `y` and `z` of the element `vertex`, in any order.
 //!
-//! What comes before the points is passed over as its header says, lists too; what comes after them is not looked at.
+//! Elements before the points are skipped according to the header, including lists; those after the points are not read.
 
 use crate::cloud::MAX_POINTS;
 use crate::point_files::{Lines, PointsError};
@@ -10,7 +10,7 @@ use crate::scalar::Scalar;
 #[derive(Debug)]
 struct Property {
     name: String,
-    /// How the length is stored, of a list.
+    /// For a list, the format of its length.
     length: Option<Scalar>,
     kind: Scalar,
 }
@@ -18,7 +18,7 @@ struct Property {
 #[derive(Debug)]
 struct Element {
     name: String,
-    /// The line that says so.
+    /// Its line in the header.
     line: usize,
     count: usize,
     properties: Vec<Property>,
@@ -30,7 +30,7 @@ enum Format {
     Binary { is_big_endian: bool },
 }
 
-/// The points of a file; coordinates may be not finite.
+/// The points of a file; coordinates may be non-finite.
 pub(crate) fn points(bytes: &[u8]) -> Result<Vec<[f64; 3]>, PointsError> {
     let mut lines = Lines::new(bytes);
     let (format, elements) = header(&mut lines)?;
@@ -167,7 +167,7 @@ fn text_item(text: &str, vertex: &Element, axes: [usize; 3]) -> Result<[f64; 3],
     }
 }
 
-/// Where a binary file is read.
+/// A reader of binary records.
 struct Records<'b> {
     bytes: &'b [u8],
     at: usize,
@@ -180,7 +180,7 @@ impl Records<'_> {
         PointsError::Byte { offset: self.bytes.len(), reason }
     }
 
-    /// Passes over an element.
+    /// Skips an element.
     fn pass(&mut self, element: &Element) -> Result<(), PointsError> {
         if element.properties.iter().all(|property| property.length.is_none()) {
             let size: usize = element.properties.iter().map(|property| property.kind.size()).sum();
@@ -189,7 +189,7 @@ impl Records<'_> {
             self.at += all.ok_or_else(|| self.cut(element, left.checked_div(size).unwrap_or(0)))?;
             return Ok(());
         }
-        // Each has a list, which takes at least the byte of its length.
+        // Each item has a list, which takes at least the byte of its length.
         (0..element.count).try_for_each(|item| self.item(element, item, &mut |_, _| {}))
     }
 
@@ -207,7 +207,7 @@ impl Records<'_> {
         Ok(points)
     }
 
-    /// Reads one, and shows the numbers that are no lists by their property.
+    /// Reads one item, and passes the numbers that are not in lists to `show`, with their property's index.
     fn item(&mut self, element: &Element, item: usize, show: &mut dyn FnMut(usize, f64)) -> Result<(), PointsError> {
         for (index, property) in element.properties.iter().enumerate() {
             let first = property.length.unwrap_or(property.kind);
@@ -218,7 +218,7 @@ impl Records<'_> {
                 show(index, number);
                 continue;
             }
-            // A length that is negative or not whole passes over nothing that is sensible.
+            // A length that is negative or not whole cannot be skipped.
             if number < 0.0 || number.fract() != 0.0 || !number.is_finite() {
                 let reason = format!("the list `{}` has a length of {number}", property.name);
                 return Err(PointsError::Byte { offset: self.at - first.size(), reason });

@@ -1,11 +1,11 @@
-//! Postures that bring a link of any robot to where it is wanted, within tolerances.
+//! Inverse kinematics: postures that bring a link of any robot to a target pose, within tolerances.
 //!
-//! Numeric: damped least squares on the geometric Jacobian, from a given posture or from random ones. What is within its
-//! tolerance counts as no error, so the same descent serves poses to be reached ([`Target::at`]), poses about an axis, and
-//! constraints that a whole path keeps, such as "upright" ([`Target::upright`]). Arms of seven joints with a spherical shoulder
-//! and wrist (`spherical`, `elbow`) and most of those with six (`closed_form`, `six`) are solved in closed form: every pose that they
-//! reach is found, and it is certain when one is out of reach. What has more joints is solved in closed form for places of one or a few
-//! of its joints, where the others allow it. Deterministic: the randomness comes from the caller.
+//! Numeric: damped least squares on the geometric Jacobian, from a given posture or from random ones. Errors within the tolerance count as
+//! zero, so the same descent serves exact poses ([`Target::at`]), poses with a free rotation about an axis, and constraints for a whole path,
+//! such as "upright" ([`Target::upright`]). Arms of seven joints with a spherical shoulder and wrist (`spherical`, `elbow`) and most arms
+//! with six (`closed_form`, `six`) are solved in closed form: every reachable pose is found, and unreachable ones are recognized for certain.
+//! Chains with more joints are solved in closed form for fixed values of one or a few joints, where the others allow it. Deterministic: the
+//! caller provides the random numbers.
 
 use crate::closed_form::ClosedForm;
 use crate::elbow::{self, Arc};
@@ -19,72 +19,72 @@ use rand::{Rng, RngExt};
 use ratn_model::pose::Pose;
 use std::f64::consts::PI;
 
-/// Iterations of one descent.
+/// Maximum number of iterations of a descent.
 const MAX_ITERATIONS: usize = 80;
 
-/// The greatest change of a joint in one iteration, in radians.
+/// Maximum change of a joint in one iteration, in radians.
 const MAX_STEP: f64 = 0.4;
 
-/// A descent aims at this share of the tolerances, so that it does not creep along their edge.
+/// A descent aims at this fraction of the tolerances, so that it does not creep along their edge.
 const INNER: f64 = 0.9;
 
-/// Tolerances below this leave nothing open, in metres or radians.
+/// Smaller tolerances count as exact, in metres or radians.
 const EXACT: f64 = 1e-4;
 
-/// Arcs of the elbow's turns that are looked at for the nearest posture.
+/// Number of arcs of elbow angles that are tried for the nearest posture.
 const ARCS_TRIED: usize = 4;
 
-/// A joint that is held while the others are solved is tried at so many places of its range on the way from where it is.
+/// A held joint is tried at this many values across its range, from its present value outwards, while the others are solved.
 const STEPS: usize = 64;
 
-/// And at so many random ones in an attempt anywhere.
+/// Number of random values of held joints in an attempt anywhere.
 const DRAWS: usize = 8;
 
-/// Descents of an attempt anywhere, until one arrives. With twenty attempts every one of 10,000 random poses is found, of an arm that is not
-/// solved in closed form.
+/// Number of descents in an attempt anywhere, until one succeeds. With twenty attempts every one of 10,000 random poses is found, for an arm
+/// that is not solved in closed form.
 const DESCENTS: usize = 2;
 
-/// Between postures of a family the elbow turns by this much at the most, in radians; at the edge of an arc they are this share of it inside.
+/// Maximum elbow rotation between neighbouring postures of a family, in radians; at the edge of an arc they lie inside by this fraction of
+/// it.
 const FAMILY_TURN: f64 = 0.15;
 const ARC_EDGE: f64 = 1e-3;
 
-/// A joint that is held is at so many places in the postures of a family; several of them are so together.
+/// Number of values of a held joint in the postures of a family; shared by several held joints.
 const FAMILY_HELD: usize = 48;
 
-/// Two postures closer than this are the same one, in radians.
+/// Two postures closer than this are considered equal, in radians.
 const SAME: f64 = 0.05;
 
-/// One row of a Jacobian; a column per joint.
+/// A row of a Jacobian, with a column per joint.
 type Row = [f64; MAX_JOINTS];
 
-/// A pose that a link is to reach, with tolerances.
+/// A target pose of a link, with tolerances.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Target {
-    /// The pose in the frame of the robot's root.
+    /// The pose in the root's frame.
     pub pose: Pose,
-    /// How far the link may be off along the axes of that pose, in metres.
+    /// Position tolerance along the axes of that pose, in metres.
     pub tolerance_m: [f64; 3],
-    /// How far it may be turned about them, in radians. A half turn about z or more means: any turn about z, and x and y count
-    /// for the direction of the z axis together.
+    /// Rotation tolerance about these axes, in radians. Half a turn or more about z allows any rotation about z; x and y then bound the
+    /// direction of the z axis together.
     pub tolerance_rad: [f64; 3],
-    /// The middle and the axes of the tolerances of position, where they are not those of `pose`.
+    /// The origin and the axes of the position tolerances, where they differ from those of `pose`.
     pub bounds: Option<Pose>,
 }
 
 impl Target {
-    /// The pose itself, to within a micrometre and a microradian.
+    /// The exact pose, to within a micrometre and a microradian.
     pub fn at(pose: Pose) -> Target {
         Target { pose, tolerance_m: [1e-6; 3], tolerance_rad: [1e-6; 3], bounds: None }
     }
 
-    /// Anywhere, with the z axis of a frame whose rotation is that of `pose` at most `tolerance_rad` off its direction.
+    /// Any position, with the z axis of the frame at most `tolerance_rad` from the z axis of `pose`.
     pub fn upright(pose: Pose, tolerance_rad: f64) -> Target {
         let tolerance_rad = [tolerance_rad, tolerance_rad, PI];
         Target { pose, tolerance_m: [f64::INFINITY; 3], tolerance_rad, bounds: None }
     }
 
-    /// What is missing from a pose to this beyond the tolerances, position and rotation vector in the target's frame; zero where
-    /// it is reached.
+    /// The error of a pose beyond the tolerances, as position and rotation vector in the target's frame; zero where the target is reached.
     fn error(&self, have: &Pose, share: f64) -> [f64; 6] {
         let inverse = self.pose.inverse();
         let off = self.off(have);
@@ -111,13 +111,13 @@ impl Target {
         [x, y, z, i, j, k]
     }
 
-    /// From a pose to the middle of the tolerances of position, along their axes.
+    /// The vector from a pose to the centre of the position tolerances, in their axes.
     fn off(&self, have: &Pose) -> [f64; 3] {
         let middle = self.bounds.as_ref().unwrap_or(&self.pose);
         rotate(&middle.inverse(), difference(middle.position, have.position))
     }
 
-    /// How far the frame may move from a pose, in metres, and turn, in radians, within the tolerances; less than nothing beyond them.
+    /// How far the frame may move from a pose, in metres, and rotate, in radians, within the tolerances; negative outside of them.
     pub(crate) fn room(&self, have: &Pose) -> [f64; 2] {
         let off = self.off(have);
         let left_m = (0..3).map(|i| self.tolerance_m[i] - off[i].abs()).fold(f64::INFINITY, f64::min);
@@ -132,7 +132,7 @@ impl Target {
         [left_m, left_rad]
     }
 
-    /// Which parts of an error a step has to mind: those that are free to change are left out.
+    /// The components of an error that a step has to respect; those that are free to change are left out.
     fn minds(&self, error: &[f64; 6]) -> [bool; 6] {
         let tolerance = |i: usize| if i < 3 { self.tolerance_m[i] } else { self.tolerance_rad[i - 3] };
         std::array::from_fn(|i| error[i] != 0.0 || tolerance(i) < EXACT)
@@ -143,7 +143,7 @@ impl Target {
         self.error(pose, 1.0) == [0.0; 6]
     }
 
-    /// Whether the tolerances leave nothing open, to speak of.
+    /// Whether the tolerances are negligible.
     fn is_exact(&self) -> bool {
         self.tolerance_m.iter().chain(&self.tolerance_rad).all(|t| *t < EXACT)
     }
@@ -152,15 +152,15 @@ impl Target {
 /// The chain of joints from a robot's root to one of its links.
 #[derive(Debug, Clone)]
 pub struct Reach {
-    /// From the root: where each moving link's joint sits in the frame before it.
+    /// From the root: for each joint that moves the link, its pose in the frame before it.
     chain: Vec<(Pose, Drive)>,
-    /// The link in the frame of the last joint.
+    /// The pose of the link in the frame of the last joint.
     tip: Pose,
     joints: Vec<Joint>,
-    /// Joints that are planned for and do not move the link.
+    /// Planned joints that do not move the link.
     others: Vec<usize>,
     spherical: Option<Spherical>,
-    /// Where the chain is not spherical at both ends.
+    /// For chains that are not spherical at both ends.
     closed_form: Option<ClosedForm>,
     levers: Levers,
 }
@@ -172,21 +172,21 @@ pub struct Postures {
     form: Form,
 }
 
-/// How postures are found.
+/// How the postures are found.
 #[derive(Debug, Clone)]
 enum Form {
-    /// By descent alone.
+    /// By numeric descent only.
     Numeric,
-    /// By the turns of the elbow that keep the limits.
+    /// By the elbow angles within the joint limits.
     Arcs(Vec<Arc>),
-    /// With some joints of the chain held.
+    /// By holding some joints of the chain.
     Held,
-    /// It is certain that there are none.
+    /// There are none for certain.
     OutOfReach,
 }
 
 impl Postures {
-    /// Whether it is certain that there are none.
+    /// Whether there are no postures for certain.
     pub fn is_empty(&self) -> bool {
         match &self.form {
             Form::Arcs(arcs) => arcs.is_empty(),
@@ -204,7 +204,7 @@ struct Axis {
 }
 
 impl Reach {
-    /// The chain to the link with this index, and from there to a frame fixed to it.
+    /// The chain to the link with this index, extended by a frame fixed to that link.
     pub fn new(mechanism: &Mechanism, link: usize, frame: Pose) -> Reach {
         let Chain { joints: chain, tip } = Chain::to(link, &mechanism.links, |link| (link.origin, link.drive));
         let tip = tip.compose(&frame);
@@ -222,17 +222,17 @@ impl Reach {
         &self.joints
     }
 
-    /// How far the frame moves while the joints do.
+    /// Bounds of the frame's motion by joint motion.
     pub(crate) fn levers(&self) -> &Levers {
         &self.levers
     }
 
-    /// How many joints the robot has.
+    /// Number of joints of the robot.
     pub fn joints(&self) -> usize {
         self.joints.len()
     }
 
-    /// The frame in the frame of the root.
+    /// The pose of the frame in the root's frame.
     pub fn pose(&self, positions: &JointVector) -> Pose {
         let place = |pose: &Pose, (origin, drive): &(Pose, Drive)| {
             compose(&compose(pose, origin), &drive.moved(positions[drive.joint]))
@@ -240,7 +240,7 @@ impl Reach {
         compose(&self.chain.iter().fold(Pose::IDENTITY, |pose, link| place(&pose, link)), &self.tip)
     }
 
-    /// How fast the frame moves, in metres per second, and turns, in radians per second, where the joints have these velocities.
+    /// The frame's speed, in metres per second, and angular speed, in radians per second, at these joint velocities.
     pub(crate) fn speeds(&self, positions: &JointVector, velocities: &JointVector) -> [f64; 2] {
         let (axes, tip) = self.axes(positions);
         let rows = jacobian(&axes, &tip, &[Pose::IDENTITY; 2], [true; 6]);
@@ -274,10 +274,10 @@ impl Reach {
             let views = [target.bounds.as_ref().unwrap_or(&target.pose), &target.pose].map(Pose::inverse);
             let mut rows = jacobian(&axes, &tip, &views, target.minds(&error));
             let (off, turned) = (norm([error[0], error[1], error[2]]), norm([error[3], error[4], error[5]]));
-            // Far away a heavily damped step keeps the descent steady; close by it is nearly Newton's.
+            // Far from the target, heavy damping keeps the descent steady; close to it the step is nearly Newton's.
             let damping = f64::clamp(1e-3 * (off + turned), 1e-9, 1e-3);
             let mut step = damped_step(&rows, &error, damping, self.joints.len())?;
-            // What a joint at its limit would do the others have to do.
+            // The other joints have to replace the motion of a joint at its limit.
             while self.stop_at_limits(&positions, &step, &mut rows) {
                 step = damped_step(&rows, &error, damping, self.joints.len())?;
             }
@@ -291,7 +291,7 @@ impl Reach {
         None
     }
 
-    /// Takes the joints out of a Jacobian that are at a limit and that a step would move beyond it; whether there were any.
+    /// Removes from a Jacobian the joints that are at a limit and that a step would move beyond it; returns whether there were any.
     fn stop_at_limits(&self, positions: &JointVector, step: &Row, rows: &mut [Row; 6]) -> bool {
         let mut stopped = false;
         for (j, joint) in self.joints.iter().enumerate() {
@@ -305,7 +305,7 @@ impl Reach {
         stopped
     }
 
-    /// The postures that meet a target, to be taken from by [`Reach::nearest`] and [`Reach::anywhere`].
+    /// The postures that meet a target, to be drawn by [`Reach::nearest`] and [`Reach::anywhere`].
     pub fn postures(&self, target: &Target) -> Postures {
         let form = match (&self.spherical, &self.closed_form) {
             (Some(arm), _) if target.is_exact() => Form::Arcs(elbow::arcs(arm, &target.pose, &self.joints)),
@@ -319,7 +319,7 @@ impl Reach {
         Postures { target: *target, form }
     }
 
-    /// Up to `wanted` different postures from at most `attempts`, nearest to `near` first.
+    /// Up to `wanted` different postures from at most `attempts` attempts, nearest to `near` first.
     pub fn solutions(
         &self,
         target: &Target,
@@ -343,7 +343,7 @@ impl Reach {
         sorted(found, near)
     }
 
-    /// The postures of one attempt, nearest to `near` first: the first with those close to it, further ones anywhere.
+    /// The postures of one attempt, nearest to `near` first: the first attempt finds those close to `near`, later ones any.
     pub fn attempt(
         &self,
         postures: &Postures,
@@ -354,7 +354,7 @@ impl Reach {
         if attempt == 0 { self.nearest(postures, near) } else { self.anywhere(postures, near, random) }
     }
 
-    /// Postures close to `near`, the nearest first. Joints that do not move the link stay where they are there.
+    /// Postures close to `near`, nearest first. Joints that do not move the link keep their values.
     pub fn nearest(&self, postures: &Postures, near: &JointVector) -> Vec<JointVector> {
         match (&postures.form, &self.spherical, &self.closed_form) {
             (Form::Arcs(arcs), Some(arm), _) => {
@@ -377,8 +377,8 @@ impl Reach {
         }
     }
 
-    /// Postures anywhere, the nearest to `near` first. Joints that do not move the link stay where they are there half of the time: elsewhere
-    /// they may be out of the way of everything.
+    /// Postures anywhere, nearest to `near` first. Joints that do not move the link keep their values half of the time: with other values
+    /// they may be out of everything's way.
     pub fn anywhere(&self, postures: &Postures, near: &JointVector, random: &mut impl Rng) -> Vec<JointVector> {
         let stays = self.others.is_empty() || random.random_bool(0.5);
         let others = if stays { *near } else { self.random(random) };
@@ -413,13 +413,13 @@ impl Reach {
         }
     }
 
-    /// Whether poses have whole families of postures that are known: the chain has more joints than they need, and is solved in closed form.
+    /// Whether poses have whole families of known postures: the chain is redundant and solved in closed form.
     pub(crate) fn has_families(&self) -> bool {
         self.spherical.is_some() || self.closed_form.as_ref().is_some_and(|form| !form.held.is_empty())
     }
 
-    /// Postures of a pose all over its families, close to each other. Joints that do not move the link are as in `near`, and what turns
-    /// round and round is in the turn nearest to it.
+    /// Closely spaced postures from all families of a pose. Joints that do not move the link are as in `near`, and joints with several turns
+    /// use the turn nearest to it.
     pub(crate) fn family(&self, target: &Target, near: &JointVector) -> Vec<JointVector> {
         let postures = self.postures(target);
         match (&postures.form, &self.closed_form) {
@@ -454,7 +454,7 @@ impl Reach {
         }
     }
 
-    /// The postures with the held joints where they are closest to `near`, each solved joint in its turn nearest to it.
+    /// The postures whose held joints are closest to `near`, each solved joint in the turn nearest to it.
     fn nearest_held(&self, form: &ClosedForm, target: &Target, near: &JointVector) -> Vec<JointVector> {
         let here = self.solve_held(form, target, near);
         if !here.is_empty() {
@@ -480,10 +480,10 @@ impl Reach {
         Vec::new()
     }
 
-    /// The postures with the held joints as in `others`, the nearest to them first.
+    /// The postures with the held joints as in `others`, nearest to them first.
     fn solve_held(&self, form: &ClosedForm, target: &Target, others: &JointVector) -> Vec<JointVector> {
         let solved = form.solve(&self.chain, &self.tip, &self.joints, &target.pose, others);
-        // Axes that are rounded in the URDF, and limits, leave a little to mend.
+        // Rounded axes in the URDF, and limits, need a small correction.
         sorted(solved.postures.iter().filter_map(|posture| self.descend(target, posture)).collect(), others)
     }
 
@@ -491,13 +491,13 @@ impl Reach {
     fn solve(&self, postures: &Postures, bend: f64, turn: f64, others: &JointVector) -> Vec<JointVector> {
         let target = &postures.target;
         let Some(arm) = &self.spherical else { return Vec::new() };
-        // At the end of an arc a joint is at its limit, but for rounding.
+        // At the end of an arc a joint is at its limit, up to rounding.
         let clamped =
             arm.solve(&target.pose, bend, turn, &self.joints, others).into_iter().map(|posture| self.clamp(&posture));
         clamped.filter(|posture| target.is_met_by(&self.pose(posture))).collect()
     }
 
-    /// Each joint's axis and a point on it, in the root's frame; and the frame.
+    /// Each joint's axis with a point on it, in the root's frame; and the frame's pose.
     fn axes(&self, positions: &JointVector) -> (Vec<Axis>, Pose) {
         let mut axes = Vec::with_capacity(self.chain.len());
         let mut pose = Pose::IDENTITY;
@@ -510,8 +510,7 @@ impl Reach {
     }
 }
 
-/// Rows: the velocity of the tip and its angular velocity per joint, as seen from frames turned by `views`; those that are not minded
-/// are zero.
+/// The rows are the linear and angular velocity of the tip per joint, in frames rotated by `views`; rows that are not minded are zero.
 fn jacobian(axes: &[Axis], tip: &Pose, views: &[Pose; 2], minded: [bool; 6]) -> [Row; 6] {
     let mut rows = [[0.0; MAX_JOINTS]; 6];
     for Axis { direction, point, drive } in axes {
@@ -528,7 +527,7 @@ fn jacobian(axes: &[Axis], tip: &Pose, views: &[Pose; 2], minded: [bool; 6]) -> 
     rows
 }
 
-/// Whether a posture is none of these.
+/// Whether a posture differs from all of these.
 pub(crate) fn is_new(found: &[JointVector], posture: &JointVector) -> bool {
     found.iter().all(|other| distance(other, posture) > SAME)
 }
@@ -548,12 +547,12 @@ pub(crate) fn rotation_vector(rotation: &Pose) -> [f64; 3] {
     let turn = rotation.quaternion_xyzw;
     let [i, j, k, w] = if turn[3] < 0.0 { turn.map(|c| -c) } else { turn };
     let sine = norm([i, j, k]);
-    // Near zero the angle is twice the sine of its half.
+    // Near zero the angle is about twice the sine of its half.
     let scale = if sine > 1e-9 { 2.0 * sine.atan2(w) / sine } else { 2.0 };
     [i * scale, j * scale, k * scale]
 }
 
-/// The shortest rotation from one direction to another, as a rotation vector; about any axis for opposite ones.
+/// The shortest rotation from one direction to another, as a rotation vector; for opposite directions about any axis.
 fn between_directions(from: [f64; 3], to: [f64; 3]) -> [f64; 3] {
     let axis = cross(from, to);
     let (sine, cosine) = (norm(axis), (0..3).map(|i| from[i] * to[i]).sum::<f64>());
@@ -582,7 +581,7 @@ fn damped_step(jacobian: &[Row; 6], error: &[f64; 6], damping: f64, joints: usiz
     Some(std::array::from_fn(|j| (0..6).map(|row| jacobian[row][j] * solved[row]).sum()))
 }
 
-/// Gauss elimination with partial pivoting; the right side is the last column.
+/// Gaussian elimination with partial pivoting; the last column is the right-hand side.
 pub(crate) fn solve(system: &mut [[f64; 7]; 6]) -> Option<[f64; 6]> {
     for column in 0..6 {
         let pivot = (column..6).max_by(|a, b| system[*a][column].abs().total_cmp(&system[*b][column].abs()))?;

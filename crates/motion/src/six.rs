@@ -1,37 +1,37 @@
-//! Six turning joints solved in closed form, where their axes allow it: a spherical wrist behind a shoulder whose first two axes meet or
-//! whose second and third are parallel, or three parallel axes before two that meet. Each is also known from behind: then the
-//! shoulder is the spherical part.
+//! Closed-form inverse kinematics for six revolute joints with suitable axes: a spherical wrist behind a shoulder whose first two axes intersect or whose
+//! second and third are parallel, or three parallel axes before two that intersect. The reverse of each is supported as well: then the shoulder is the
+//! spherical part.
 //!
-//! Products of exponentials, one unknown at a time: what a joint does not change gives the equation of another (Paden and Kahan's
-//! subproblems; Murray, Li, Sastry: *A Mathematical Introduction to Robotic Manipulation*, 3.3; Elias and Wen: *IK-Geo*, 2022, for
-//! which arms fall apart in this way). Limits, and which of the turns of a joint is meant, are the caller's.
+//! Products of exponentials, one unknown at a time: quantities that a joint does not change give the equation of another joint (Paden-Kahan subproblems;
+//! Murray, Li, Sastry: *A Mathematical Introduction to Robotic Manipulation*, 3.3; Elias and Wen: *IK-Geo*, 2022, for which arms decompose in this way). Joint
+//! limits, and the choice among the turns of a joint, are left to the caller.
 
 use crate::frame::{compose, cross, difference, norm, rotate};
 use crate::spherical::{Vector, about, angle_about, dot};
 use ratn_model::pose::Pose;
 use std::f64::consts::TAU;
 
-/// Axes that pass each other by less than this meet, in metres, and directions that differ by less are one, in radians. Angles in a URDF
-/// are often rounded to five digits; what that does to a solution the caller mends.
+/// Axes intersect if their distance is less than this, in metres, and directions are equal if they differ by less, in radians. Angles in a URDF are often
+/// rounded to five digits; the caller corrects the resulting error of a solution.
 const ROUNDED: f64 = 2e-5;
 
-/// What is below this is zero, but for rounding.
+/// Smaller values are zero up to rounding.
 const EXACT: f64 = 1e-9;
 
-/// An equation with no solution by less than this is one with two equal solutions: what the rounded axes leave.
+/// An equation that misses a solution by less than this has two equal solutions: an effect of rounded axes.
 const SLACK: f64 = 1e-4;
 
-/// Where an angle is of no influence at all, so many are taken, evenly spread.
+/// Number of evenly spaced angles that are used where an angle has no influence.
 const SPREAD: usize = 16;
 
-/// An axis that is turned about.
+/// A rotation axis.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Axis {
     pub(crate) direction: Vector,
     pub(crate) point: Vector,
 }
 
-/// The ways in which six axes fall apart.
+/// How the six axes decompose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Kind {
     shape: Shape,
@@ -41,25 +41,25 @@ pub(crate) struct Kind {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Shape {
-    /// The last three axes meet, and the first two.
+    /// The last three axes intersect, and so do the first two.
     WristAndShoulder,
-    /// The last three axes meet; the second and the third are parallel.
+    /// The last three axes intersect; the second and the third are parallel.
     WristAndElbow,
-    /// The second to fourth axes are parallel; the last two meet.
+    /// The second to fourth axes are parallel; the last two intersect.
     ThreeParallel,
 }
 
-/// What six joints can be for a motion.
+/// The solutions for a motion.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Solutions {
-    /// Angles in no particular turn.
+    /// Joint angles, not resolved to a particular turn.
     pub(crate) all: Vec<[f64; 6]>,
-    /// Whether a joint was of no influence, so that there are more, of which these are some.
+    /// Whether a joint had no influence, so that these are samples of infinitely many solutions.
     pub(crate) is_singular: bool,
 }
 
 impl Kind {
-    /// The first of the shapes that six axes have.
+    /// The first shape that fits six axes.
     pub(crate) fn of(axes: &[Axis; 6]) -> Option<Kind> {
         [false, true].into_iter().find_map(|is_reversed| {
             let axes = if is_reversed { reversed(axes) } else { *axes };
@@ -67,12 +67,12 @@ impl Kind {
         })
     }
 
-    /// Whether the axes have this shape exactly, so that what has no solution cannot be reached.
+    /// Whether the axes have this shape exactly, so that a pose without a solution is certainly unreachable.
     pub(crate) fn is_exact(self, axes: &[Axis; 6]) -> bool {
         shape(&if self.is_reversed { reversed(axes) } else { *axes }, EXACT) == Some(self.shape)
     }
 
-    /// The angles that make up a motion of what the last joint carries, counted from where the axes are given.
+    /// The joint angles that produce a motion of the last link, measured from the given axes.
     pub(crate) fn solve(self, axes: &[Axis; 6], motion: &Pose) -> Solutions {
         if !self.is_reversed {
             return self.shape.solve(axes, motion);
@@ -111,7 +111,7 @@ fn shape(axes: &[Axis; 6], within: f64) -> Option<Shape> {
         .then_some(Shape::ThreeParallel)
 }
 
-/// The axes as seen from the last link: the inverse of a product has its factors in reverse, each inverted.
+/// The axes as seen from the last link: the inverse of a product has its inverted factors in reverse order.
 fn reversed(axes: &[Axis; 6]) -> [Axis; 6] {
     std::array::from_fn(|i| {
         let Axis { direction, point } = axes[5 - i];
@@ -119,7 +119,7 @@ fn reversed(axes: &[Axis; 6]) -> [Axis; 6] {
     })
 }
 
-/// The first three joints bring the wrist to its place, the last three turn it.
+/// The first three joints move the wrist to its position, the last three orient it.
 fn solve_wrist(shape: Shape, axes: &[Axis; 6], motion: &Pose, found: &mut Solutions) {
     let Some((wrist, _)) = between(&axes[3], &axes[4]) else { return };
     let target = motion.transform(wrist);
@@ -161,7 +161,7 @@ fn solve_three_parallel(axes: &[Axis; 6], motion: &Pose, found: &mut Solutions) 
     let target = motion.transform(wrist);
     let wanted = dot(along, difference(wrist, axes[0].point));
     let [fifth, sixth] = [axes[4].direction, axes[5].direction];
-    // Parallel axes may point opposite ways.
+    // Parallel axes may point in opposite directions.
     let [third_sign, fourth_sign] = [2, 3].map(|i: usize| dot(axes[i].direction, along).signum());
     for back in found.angles(wave(axes[0].direction, difference(target, axes[0].point), along), wanted) {
         let rest = compose(&exponential(&axes[0], back), motion);
@@ -169,7 +169,7 @@ fn solve_three_parallel(axes: &[Axis; 6], motion: &Pose, found: &mut Solutions) 
         for e in found.angles(wave(fifth, sixth, along), dot(along, seen)) {
             let tilted = rotate(&about(fifth, e), sixth);
             let in_line = norm(cross(along, tilted)) < SLACK;
-            // In line with the three the last axis turns as they do, so that any share of it is right.
+            // If the last axis is in line with the three parallel ones it rotates as they do, so that any division of the angle is right.
             found.is_singular |= in_line;
             let mut sums = vec![angle_about(along, tilted, seen)];
             sums.extend(in_line.then(evenly).into_iter().flatten());
@@ -187,7 +187,7 @@ fn solve_three_parallel(axes: &[Axis; 6], motion: &Pose, found: &mut Solutions) 
 }
 
 impl Solutions {
-    /// Angles where `[sine, cosine, constant]` is a value.
+    /// Angles at which `sine · sin + cosine · cos + constant` has a value.
     fn angles(&mut self, [sine, cosine, constant]: [f64; 3], value: f64) -> Vec<f64> {
         let (size, missing) = (sine.hypot(cosine), value - constant);
         if missing.abs() > size + SLACK {
@@ -202,14 +202,14 @@ impl Solutions {
         angles
     }
 
-    /// Angles about an axis that bring a point to a distance from another one.
+    /// Angles about an axis that bring a point to a distance from another point.
     fn distances(&mut self, axis: &Axis, point: Vector, from: Vector, distance: f64) -> Vec<f64> {
         let (arm, offset) = (difference(point, axis.point), difference(axis.point, from));
         let product = (distance * distance - dot(arm, arm) - dot(offset, offset)) / 2.0;
         self.angles(wave(axis.direction, arm, offset), product)
     }
 
-    /// Angles of two parallel axes that bring a point to a target as far along them.
+    /// Angles of two parallel axes that bring a point to a target at the same position along them.
     fn two_parallel(&mut self, first: &Axis, second: &Axis, point: Vector, target: Vector) -> Vec<[f64; 2]> {
         let seen = difference(target, first.point);
         let bends = self.distances(second, point, first.point, norm(seen));
@@ -220,7 +220,7 @@ impl Solutions {
         bends.into_iter().map(both).collect()
     }
 
-    /// The ways to make a rotation of three turns.
+    /// Decompositions of a rotation into three turns.
     fn three_turns(&mut self, [a, b, c]: [Vector; 3], rotation: &Pose) -> Vec<[f64; 3]> {
         let seen = rotate(rotation, c);
         let mut ways = Vec::new();
@@ -231,7 +231,7 @@ impl Solutions {
                 remaining(c, &compose(&before.inverse(), rotation))
             };
             if norm(cross(a, third)) < EXACT {
-                // Only the two outer turns together count.
+                // Only the sum of the two outer turns matters.
                 let (sum, sign) = (last(0.0), dot(a, third).signum());
                 self.is_singular = true;
                 ways.extend(evenly().into_iter().map(|share| [sign * (sum - share), middle, share]));
@@ -244,13 +244,13 @@ impl Solutions {
     }
 }
 
-/// How far a vector that is turned backwards or forwards about a unit vector points along another: coefficients of sine and cosine of the angle, and a constant.
+/// The component along a vector of another vector rotated about a unit vector: coefficients of sine and cosine of the angle, and a constant.
 fn wave(axis: Vector, turned: Vector, along: Vector) -> [f64; 3] {
     let constant = dot(axis, turned) * dot(axis, along);
     [dot(along, cross(axis, turned)), dot(along, turned) - constant, constant]
 }
 
-/// The angle of a rotation that is one about this axis.
+/// The angle of a rotation about this axis.
 fn remaining(axis: Vector, rotation: &Pose) -> f64 {
     let [x, y, z, w] = rotation.quaternion_xyzw;
     2.0 * dot(axis, [x, y, z]).atan2(w)
@@ -260,7 +260,7 @@ fn evenly() -> Vec<f64> {
     (0..SPREAD).map(|i| TAU * i as f64 / SPREAD as f64).collect()
 }
 
-/// The motion of a turn about an axis.
+/// The rigid motion of a rotation about an axis.
 fn exponential(axis: &Axis, angle: f64) -> Pose {
     let turn = about(axis.direction, angle);
     Pose { position: difference(axis.point, rotate(&turn, axis.point)), ..turn }
@@ -270,7 +270,7 @@ fn turned(axis: &Axis, angle: f64, point: Vector) -> Vector {
     exponential(axis, angle).transform(point)
 }
 
-/// The middle between the closest points of two axes, and how far these are from each other; nothing for parallel ones.
+/// The midpoint between the closest points of two axes, and their distance; `None` for parallel axes.
 fn between(a: &Axis, b: &Axis) -> Option<(Vector, f64)> {
     let normal = cross(a.direction, b.direction);
     let square = dot(normal, normal);

@@ -1,8 +1,7 @@
-//! Arms of seven turning joints with a spherical shoulder and a spherical wrist, solved in closed form: the elbow from the
-//! distance of the wrist, the shoulder and the wrist as three turns each, and the one free motion that a pose leaves, the turn
-//! of the elbow about the line from shoulder to wrist, chosen by the caller. All axes as they are at zero positions, products
-//! of exponentials from there (Paden and Kahan's subproblems; Murray, Li, Sastry: *A Mathematical Introduction to Robotic
-//! Manipulation*, 3.3).
+//! Closed-form inverse kinematics for arms of seven revolute joints with a spherical shoulder and a spherical wrist: the elbow from the
+//! distance of the wrist, the shoulder and the wrist as three turns each. The caller chooses the redundancy: the rotation of the elbow
+//! about the line from shoulder to wrist. All axes are those at zero positions, with products of exponentials from there (Paden-Kahan
+//! subproblems; Murray, Li, Sastry: *A Mathematical Introduction to Robotic Manipulation*, 3.3).
 
 use crate::frame::{compose, cross, difference, norm, rotate};
 use crate::joint_vector::JointVector;
@@ -10,10 +9,10 @@ use crate::robot_model::{Drive, Joint};
 use ratn_model::pose::Pose;
 use std::f64::consts::{PI, TAU};
 
-/// Axes that pass each other by less than this meet, in metres; directions with a smaller product are perpendicular.
+/// Axes intersect if their distance is less than this, in metres; directions with a smaller scalar product are perpendicular.
 const MEETING: f64 = 1e-9;
 
-/// Axes this close to one direction turn about the same one, in radians: a tenth of what a pose may be off.
+/// Axes within this angle count as parallel, in radians: a tenth of a pose's tolerance.
 const IN_LINE: f64 = 1e-7;
 
 pub(crate) type Vector = [f64; 3];
@@ -22,7 +21,7 @@ pub(crate) type Vector = [f64; 3];
 #[derive(Debug, Clone)]
 pub(crate) struct Spherical {
     pub(crate) axes: [Vector; 7],
-    /// Which position turns each axis.
+    /// The position index of each axis.
     pub(crate) joints: [usize; 7],
     shoulder: Vector,
     /// A point on the elbow's axis.
@@ -32,7 +31,7 @@ pub(crate) struct Spherical {
 }
 
 impl Spherical {
-    /// Where a chain is such an arm and nothing else.
+    /// The geometry of a chain, if it is such an arm.
     pub(crate) fn of(chain: &[(Pose, Drive)], tip: &Pose) -> Option<Spherical> {
         let chain: &[(Pose, Drive); 7] = chain.try_into().ok()?;
         let mut pose = Pose::IDENTITY;
@@ -56,7 +55,7 @@ impl Spherical {
         Some(Spherical { axes, joints, shoulder, elbow: points[3], wrist, tip: compose(&pose, tip) })
     }
 
-    /// How far the elbow of a posture is turned about the line from shoulder to wrist, as [`Spherical::solve`] counts it.
+    /// The elbow's rotation about the line from shoulder to wrist in a posture, as [`Spherical::solve`] counts it.
     pub(crate) fn turn(&self, positions: &JointVector) -> f64 {
         let q: [f64; 7] = std::array::from_fn(|i| positions[self.joints[i]]);
         let shoulder = self.three(0, [q[0], q[1], q[2]]);
@@ -68,14 +67,14 @@ impl Spherical {
         wrapped(2.0 * along.atan2(rest[3]))
     }
 
-    /// The bends of the elbow with which the wrist is where a pose needs it; none where that is too far away or too close.
+    /// The elbow angles that put the wrist where a pose needs it; empty where that is too far away or too close.
     pub(crate) fn bends_for(&self, target: &Pose) -> Vec<f64> {
         let motion = self.motion(target);
         self.bends(norm(difference(motion.transform(self.wrist), self.shoulder)))
     }
 
     /// All postures that bring the frame to a pose with the elbow at one of its bends and at this turn: each joint in the turn within its
-    /// limits that is nearest to `near`, or beyond them where there is none. Joints that are none of the arm's are as in `near`.
+    /// limits that is nearest to `near`, or beyond the limits where there is none. Other joints are as in `near`.
     pub(crate) fn solve(
         &self,
         target: &Pose,
@@ -87,7 +86,7 @@ impl Spherical {
         let motion = self.motion(target);
         let mut solutions = Vec::new();
         for first in self.turns(0, &self.turned_shoulder(&motion, bend, turn)) {
-            // The turns themselves, not what they should be, so that errors do not add up.
+            // The rotation by the solved angles, not the wanted one, so that errors do not accumulate.
             let wrist = self.turned_wrist(&motion, bend, &self.three(0, first));
             for last in self.turns(4, &wrist) {
                 let mut positions = *near;
@@ -101,14 +100,14 @@ impl Spherical {
         solutions
     }
 
-    /// The rotations of the shoulder and of the wrist then.
+    /// The rotations of the shoulder and of the wrist for this pose, bend and turn.
     pub(crate) fn rotations(&self, target: &Pose, bend: f64, turn: f64) -> [Pose; 2] {
         let motion = self.motion(target);
         let shoulder = self.turned_shoulder(&motion, bend, turn);
         [shoulder, self.turned_wrist(&motion, bend, &shoulder)]
     }
 
-    /// What moves the frame from its place at zero to the target.
+    /// The motion that takes the frame from its zero pose to the target.
     fn motion(&self, target: &Pose) -> Pose {
         compose(target, &self.tip.inverse())
     }
@@ -124,13 +123,13 @@ impl Spherical {
         compose(&elbow.inverse(), motion)
     }
 
-    /// The wrist with the elbow bent.
+    /// The wrist's position after bending the elbow.
     fn bent(&self, bend: f64) -> Vector {
         let [x, y, z] = rotate(&about(self.axes[3], bend), difference(self.wrist, self.elbow));
         [x + self.elbow[0], y + self.elbow[1], z + self.elbow[2]]
     }
 
-    /// Bends of the elbow that bring the wrist this far from the shoulder.
+    /// Elbow angles that bring the wrist this far from the shoulder.
     fn bends(&self, distance: f64) -> Vec<f64> {
         let axis = self.axes[3];
         let (p, q) = (difference(self.wrist, self.elbow), difference(self.shoulder, self.elbow));
@@ -147,16 +146,16 @@ impl Spherical {
         if half < 1e-9 { vec![straight] } else { vec![straight + half, straight - half] }
     }
 
-    /// The rotation of three joints from `first` on.
+    /// The rotation by three joints from `first` on.
     fn three(&self, first: usize, angles: [f64; 3]) -> Pose {
         let turn = |i: usize| about(self.axes[first + i], angles[i]);
         compose(&compose(&turn(0), &turn(1)), &turn(2))
     }
 
-    /// The two ways to make a rotation of three joints from `first` on, each perpendicular to the next.
+    /// The two decompositions of a rotation into three joints from `first` on, each perpendicular to the next.
     fn turns(&self, first: usize, rotation: &Pose) -> [[f64; 3]; 2] {
         let [a, b, c] = [self.axes[first], self.axes[first + 1], self.axes[first + 2]];
-        // Turning c about b keeps its part along b; only the middle turn changes its part along a.
+        // Rotating c about b keeps its component along b; only the middle angle changes its component along a.
         let seen = rotate(rotation, c);
         let (cosine, sine) = (dot(a, c), dot(a, cross(b, c)));
         let (size, zero) = (cosine.hypot(sine), sine.atan2(cosine));
@@ -169,7 +168,7 @@ impl Spherical {
                 angle_about(c, b, rotate(&compose(&done.inverse(), rotation), b))
             };
             if norm(cross(a, third)) < IN_LINE {
-                // Only the two outer turns together count: half of it for each is within the most limits.
+                // Only the sum of the two outer turns matters: half of it for each satisfies the most limits.
                 let outer = last(0.0) / 2.0 * dot(a, third).signum();
                 return [outer, middle, last(outer)];
             }
@@ -179,7 +178,7 @@ impl Spherical {
     }
 }
 
-/// Where two lines meet, if they do.
+/// The intersection of two lines, if there is one.
 fn meeting(p: Vector, a: Vector, q: Vector, b: Vector) -> Option<Vector> {
     let normal = cross(a, b);
     let way = difference(q, p);
@@ -200,7 +199,7 @@ fn unit(v: Vector) -> Vector {
     v.map(|c| c / length)
 }
 
-/// A turn about a unit vector.
+/// A rotation about a unit vector.
 pub(crate) fn about([x, y, z]: Vector, angle: f64) -> Pose {
     let (sin, cos) = (angle / 2.0).sin_cos();
     Pose { position: [0.0; 3], quaternion_xyzw: [x * sin, y * sin, z * sin, cos] }
@@ -224,7 +223,7 @@ fn from_to(from: Vector, to: Vector) -> Pose {
     about(unit(axis), norm(axis).atan2(dot(from, to)))
 }
 
-/// The turn of an angle within the limits of a joint that is nearest to a position; where there is none, the nearest to the limits.
+/// The turn of an angle that is within a joint's limits and nearest to a position; without one, the turn nearest to the limits.
 fn turn_within(angle: f64, Joint { lower, upper, .. }: &Joint, near: f64) -> f64 {
     let (least, most) = (((lower - angle) / TAU).ceil(), ((upper - angle) / TAU).floor());
     let turn = if least <= most {
@@ -235,7 +234,7 @@ fn turn_within(angle: f64, Joint { lower, upper, .. }: &Joint, near: f64) -> f64
     angle + TAU * turn
 }
 
-/// The angle within half a turn of zero.
+/// The angle wrapped to half a turn around zero.
 fn wrapped(angle: f64) -> f64 {
     angle - TAU * (angle / TAU).round()
 }

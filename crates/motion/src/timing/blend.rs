@@ -1,22 +1,22 @@
-//! Rounds the corners of a path, each by itself: a quintic Bézier curve per corner, straight at both ends, as wide as the neighbours
-//! and the obstacles leave room for; without room the path is cut there, for the arm to stop.
+//! Rounds the corners of a path, each by itself: a quintic Bézier curve per corner with zero curvature at both ends, as wide as the
+//! neighbours and the obstacles allow; where there is no room, the path is cut at the corner, and the arm stops there.
 
 use super::path::{Path, Segment, between};
 use super::room::Room;
 use super::{SAGITTA_RAD, STRAIGHT_RAD};
 use crate::collision::distance;
 
-/// The widest that a corner is cut on each side, and the least, in radians.
+/// Maximum and minimum distance from a corner at which its blend begins and ends, in radians.
 pub(super) const BLEND_RAD: f64 = 0.5;
 pub(super) const LEAST_RAD: f64 = 0.002;
 
-/// How often a blend that touches something is halved before the arm stops at the corner instead.
+/// Number of halvings of a blend that touches something before the arm stops at the corner instead.
 pub(super) const BLEND_HALVINGS: usize = 5;
 
-/// A corner that turns by more is no corner but a way back: the arm stops there, in radians.
+/// A sharper corner is a reversal: the arm stops there, in radians.
 pub(super) const SHARPEST_RAD: f64 = 3.0;
 
-/// Where its control points are on each side, from its end to the corner.
+/// The control points on each side, from the blend's end to the corner.
 const CONTROLS: [f64; 3] = [0.0, 0.4, 0.8];
 
 /// The path with rounded corners, cut where the arm has to stop.
@@ -64,7 +64,7 @@ pub(crate) fn rounded<const N: usize>(
     pieces
 }
 
-/// Goes straight on to a point, if that is any way.
+/// Adds a straight line to a point, unless it has no length.
 fn line<const N: usize>(piece: &mut Path<N>, at: &mut [f64; N], to: &[f64; N]) {
     if distance(at, to) > 1e-9 {
         piece.push(Segment::line(at, to));
@@ -72,11 +72,11 @@ fn line<const N: usize>(piece: &mut Path<N>, at: &mut [f64; N], to: &[f64; N]) {
     }
 }
 
-/// How far the direction turns at a corner.
+/// The change of direction at a corner.
 pub(crate) fn bend_rad<const N: usize>(before: &[f64; N], corner: &[f64; N], after: &[f64; N]) -> f64 {
     let (near, far) = (distance(before, corner), distance(corner, after));
     let side = |j: usize| ((corner[j] - before[j]) / near, (after[j] - corner[j]) / far);
-    // Of the difference and the sum of two unit vectors: exact for small angles, too.
+    // From the difference and the sum of two unit vectors, which is exact for small angles, too.
     let (mut difference, mut sum) = (0.0, 0.0);
     for (a, b) in (0..N).map(side) {
         difference += (b - a) * (b - a);
@@ -85,15 +85,15 @@ pub(crate) fn bend_rad<const N: usize>(before: &[f64; N], corner: &[f64; N], aft
     2.0 * f64::sqrt(difference).atan2(f64::sqrt(sum))
 }
 
-/// The curve whose control points are on the two sides: where it begins and ends it has their directions and no bend.
+/// The curve with control points on both sides: at its ends it has their directions and zero curvature.
 fn bezier<const N: usize>(from: &[f64; N], corner: &[f64; N], to: &[f64; N], width: f64) -> Segment<N> {
     let before = CONTROLS.map(|share| between(from, corner, share));
     let after = CONTROLS.map(|share| between(to, corner, share));
-    // The first derivative is 5 · 0.4 · width over the length: one, as along a line.
+    // The first derivative is 5 · 0.4 · width divided by the length: one, as along a line.
     Segment::bezier(&[before[0], before[1], before[2], after[2], after[1], after[0]], 2.0 * width)
 }
 
-/// Whether the chords are free that are close enough to a segment, and no joint leaves its range.
+/// Whether sufficiently close chords of a segment are free, and no joint leaves its range.
 pub(crate) fn is_free_along<const N: usize>(
     segment: &Segment<N>,
     room: &Room<N>,

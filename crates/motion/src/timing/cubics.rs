@@ -1,11 +1,11 @@
 //! The cubic spline through given positions at given times, from rest to rest: position, velocity and acceleration are
 //! continuous, velocity and acceleration are zero at both ends, jerk is constant from knot to knot.
 //!
-//! Two positions have to give for the two ends: the spline goes past the second and the last but one as it needs to.
+//! Two positions may deviate: at the second and the last but one the spline passes where it needs to.
 
 use crate::trajectory::Knot;
 
-/// The knots of the spline; there are at least six.
+/// The knots of the spline; there have to be at least six.
 pub(crate) fn through<const N: usize>(times: &[f64], positions: &[[f64; N]]) -> Vec<Knot<[f64; N]>> {
     let n = times.len() - 1;
     let h: Vec<f64> = times.windows(2).map(|pair| pair[1] - pair[0]).collect();
@@ -25,7 +25,7 @@ pub(crate) fn through<const N: usize>(times: &[f64], positions: &[[f64; N]]) -> 
     below[2] -= first * first / (6.0 * h[1]);
     on[n - 1] += last * last / (6.0 * h[n - 2]) + last / 6.0;
     above[n - 2] -= last * last / (6.0 * h[n - 2]);
-    // Those of the two that give count as the ends beside them.
+    // The two free positions are replaced by the ends beside them.
     let fixed = |i: usize| match i {
         1 => &positions[0],
         i if i == n - 1 => &positions[n],

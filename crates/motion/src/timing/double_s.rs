@@ -1,4 +1,4 @@
-//! The quickest motion along a straight line from rest to rest within limits of velocity, acceleration and jerk: the double-S
+//! The fastest motion along a straight line from rest to rest within limits of velocity, acceleration and jerk: the double-S
 //! profile in closed form (Biagiotti and Melchiorri, *Trajectory Planning for Automatic Machines and Robots*, section 3.4).
 //!
 //! ```text
@@ -13,7 +13,7 @@ pub(crate) struct Limits {
     pub(crate) jerk: f64,
 }
 
-/// Way and velocity at the end of a phase.
+/// Position and velocity at the end of a phase.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Instant {
     pub(crate) time_s: f64,
@@ -21,10 +21,11 @@ pub(crate) struct Instant {
     pub(crate) velocity: f64,
 }
 
-/// A phase that would be shorter is left out, in seconds: a cubic over less time says little of its derivatives.
+/// Minimum duration of a phase, in seconds; shorter ones are left out, because the derivatives of a cubic over less time are
+/// numerically poor.
 const LEAST_S: f64 = 1e-4;
 
-/// The instants at which the jerk changes, the first at 0; between two of them the way is a cubic in time.
+/// The instants at which the jerk changes, the first at 0; between two of them the position is a cubic in time.
 pub(crate) fn double_s(way: f64, limits: Limits) -> Vec<Instant> {
     let Limits { velocity, acceleration, jerk } = limits;
     // How long the jerk is applied and how long the acceleration is held, to reach a velocity.
@@ -45,7 +46,7 @@ pub(crate) fn double_s(way: f64, limits: Limits) -> Vec<Instant> {
     };
     let mut peak = velocity;
     if peak * rise_s(peak) > way {
-        // No cruise: way = peak · rise, either without holding (rise = 2 √(peak / J)) or with (rise = A / J + peak / A).
+        // No cruise: way = peak · rise, either without holding (rise = 2 √(peak / J)) or with it (rise = A / J + peak / A).
         let without = (way / 2.0).powi(2).cbrt() * jerk.cbrt();
         let t = acceleration / jerk;
         let with = acceleration * (((t * t + 4.0 * way / acceleration).sqrt() - t) / 2.0);
@@ -54,7 +55,8 @@ pub(crate) fn double_s(way: f64, limits: Limits) -> Vec<Instant> {
     let (jerking, holding) = ramp(peak);
     let cruise = (way / peak - rise_s(peak)).max(0.0);
     let [jerking, holding, cruise] = [jerking, holding, cruise].map(|s| if s < LEAST_S { 0.0 } else { s });
-    // Without the phases left out the rest would not go all the way: it goes so much harder, and then so much slower.
+    // Without the phases that were left out the motion would be too short: jerk and acceleration are scaled up, and then the
+    // motion is slowed down to keep the limits.
     let rise = (jerking + holding) * (2.0 * jerking + holding + cruise);
     let (level, hard) = if jerking > 0.0 { (way / rise, way / rise / jerking) } else { (way / rise, 0.0) };
     let slower =

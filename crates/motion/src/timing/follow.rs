@@ -1,10 +1,10 @@
-//! One path from rest to rest, followed as quickly as the limits allow: the knots of its trajectory.
+//! A path from rest to rest, followed as fast as the limits allow: the knots of its trajectory.
 //!
-//! A straight line is a double S in closed form. Any other path is timed within velocity and acceleration first (`reachability`); where
-//! jerk is limited that gives the mesh for the third order (`third_order`). A cubic spline goes through the path at the points of
-//! the mesh, at their times. It is the trajectory itself, so its cubics are held against the limits in closed form: where one breaks
-//! a limit, that limit is drawn tighter there, and the path is timed again. What is left after that slows the whole path, by
-//! some thousandths.
+//! A straight line is a double S in closed form. Any other path is first timed within velocity and acceleration limits
+//! (`reachability`); where jerk is limited, that gives the mesh for the third order (`third_order`). A cubic spline interpolates the
+//! path at the points of the mesh, at their times. The spline is the trajectory itself, so its cubics are checked against the limits in
+//! closed form: where one exceeds a limit, that limit is tightened there, and the path is timed again. The remaining excess slows the
+//! whole path, by some thousandths.
 
 use super::cubics;
 use super::double_s::{self, double_s};
@@ -17,7 +17,7 @@ use crate::joint_vector::JointVector;
 use crate::robot::Joint;
 use crate::trajectory::Knot;
 
-/// What the joints may do at the chosen speed.
+/// The joints' limits at the chosen speed.
 #[derive(Debug, Clone)]
 pub(crate) struct Bounds<const N: usize> {
     pub(crate) velocities: [f64; N],
@@ -31,45 +31,45 @@ pub(crate) struct Bounds<const N: usize> {
     joints: usize,
 }
 
-/// Points of the grid of the second order on a path at least, how many on each of its segments, and how far the path turns from
-/// one to the next, in radians.
+/// Minimum number of grid points of the second order on a path and on each of its segments, and maximum change of direction between
+/// neighbouring points, in radians.
 const GRID: f64 = 240.0;
 const GRID_SEGMENT: f64 = 6.0;
 const GRID_TURN: f64 = 0.04;
 
-/// How much denser it becomes where limits are broken between its points.
+/// Factors of the grid's density, tried where limits are exceeded between its points.
 const DENSER: [f64; 3] = [2.0, 4.0, 8.0];
 
-/// The time between two knots, unless the path takes so long that there would be more of them than this.
+/// Time between two knots in seconds; longer where there would be more knots than this.
 const KNOT_S: f64 = 0.018;
 const KNOTS: f64 = 170.0;
 
-/// How far the path turns in a cell of the mesh at the most, in radians, and how much of a segment one takes.
+/// Maximum change of direction in a cell of the mesh, in radians, and minimum number of cells per segment.
 const TURN: f64 = 0.25;
 const CELLS: f64 = 2.0;
 
-/// How much longer than the way since the start a cell may be at most; the same before the end.
+/// Maximum length of a cell as a part of the distance from the start, and likewise to the end.
 const GROWTH: f64 = 0.35;
 
-/// The first cell takes this share of the time in which the acceleration is reached.
+/// The first cell takes this part of the time in which the acceleration is reached.
 const FIRST: f64 = 0.35;
 
-/// Places on a straight line at which the speed of the tool is looked at, but for the first.
+/// Number of points on a straight line at which the tool's speed is checked, in addition to the first.
 const LINE_PLACES: usize = 64;
 
-/// Knots in the first cell and in the last.
+/// Number of knots in the first cell and in the last.
 const FIRST_KNOTS: usize = 8;
 
-/// Rounds in which limits that the spline breaks are drawn tighter; by how much more than they are broken.
+/// Number of rounds in which exceeded limits are tightened, and an additional factor.
 const ROUNDS: usize = 3;
 const TIGHTER: f64 = 0.999;
-/// A limit that is broken by less is left to slowing down.
+/// A limit that is exceeded by less than this factor is handled by slowing down.
 const CLOSE: f64 = 1.003;
 
 impl<const N: usize> Bounds<N> {
     /// The limits of joints; those of velocity and acceleration are multiplied by the speed.
     pub(crate) fn new(joints: &[Joint], Speed { share: speed, tool }: Speed) -> Bounds<N> {
-        // Those beyond stand still, so any limits do.
+        // Joints beyond the robot's stand still, so their limits do not matter.
         let joint = |j: usize| joints.get(j).unwrap_or(&joints[0]);
         let limits = |j: usize| joints.get(j).map_or([0.0; 2], Joint::limits);
         Bounds {
@@ -83,13 +83,13 @@ impl<const N: usize> Bounds<N> {
         }
     }
 
-    /// How fast the path may be followed at a place, for the tool.
+    /// Maximum speed along the path at a point, because of the tool's limits.
     fn fastest(&self, at: &Derivatives<N>) -> f64 {
         let of_joints = |padded: &[f64; N]| JointVector::from_fn(self.joints, |j| padded[j]);
         self.tool.as_ref().map_or(f64::INFINITY, |tool| tool.fastest(&of_joints(&at.position), &of_joints(&at.first)))
     }
 
-    /// The limits along a line whose tool is nowhere too fast.
+    /// The limits along a line on which the tool is nowhere too fast.
     fn along_line(&self, path: &Path<N>) -> double_s::Limits {
         let mut limits = self.along(&path.segments()[0].at(0.0).first);
         if self.tool.is_some() {
@@ -99,7 +99,7 @@ impl<const N: usize> Bounds<N> {
         limits
     }
 
-    /// Whether the tool would be too fast on a line if it did not limit the motion.
+    /// Whether the tool's limits slow down a line.
     fn is_slowed(&self, path: &Path<N>) -> bool {
         self.tool.is_some() && self.along_line(path).velocity < self.along(&path.segments()[0].at(0.0).first).velocity
     }
@@ -122,7 +122,7 @@ impl<const N: usize> Bounds<N> {
     }
 }
 
-/// The knots, the first at 0; none where `goes_on`, which is asked often, says no.
+/// The knots, the first at 0; `None` where `goes_on`, which is asked often, returns false.
 pub(crate) fn follow<const N: usize>(
     path: &Path<N>,
     bounds: &Bounds<N>,
@@ -132,13 +132,13 @@ pub(crate) fn follow<const N: usize>(
         return curved(path, bounds, goes_on);
     }
     let straight = straight(path, bounds);
-    // Where the tool is too fast somewhere on the line, it need not be slow elsewhere.
+    // A tool that would be too fast somewhere on the line need not be slow elsewhere.
     let other = if bounds.is_slowed(path) { curved(path, bounds, goes_on) } else { None };
     let lasts_s = |knots: &[Knot<[f64; N]>]| knots[knots.len() - 1].time_s;
     Some(other.filter(|other| lasts_s(other) < lasts_s(&straight)).unwrap_or(straight))
 }
 
-/// Any path, as [`follow`].
+/// Follows any path, as [`follow`].
 fn curved<const N: usize>(
     path: &Path<N>,
     bounds: &Bounds<N>,
@@ -152,7 +152,7 @@ fn curved<const N: usize>(
     knots.map(|knots| slowed(knots, bounds))
 }
 
-/// About how long the path takes, for less than following it costs.
+/// The approximate duration of a path, computed faster than by [`follow`].
 pub(crate) fn estimate<const N: usize>(path: &Path<N>, bounds: &Bounds<N>) -> f64 {
     if path.is_line() {
         let instants = double_s(path.length(), bounds.along_line(path));
@@ -176,7 +176,7 @@ fn straight<const N: usize>(path: &Path<N>, bounds: &Bounds<N>) -> Vec<Knot<[f64
     instants.iter().map(knot).collect()
 }
 
-/// The path within limits of velocity and acceleration.
+/// The path timed within limits of velocity and acceleration.
 struct Second<const N: usize> {
     grid: Grid<N>,
     squares: Vec<f64>,
@@ -216,7 +216,7 @@ impl<const N: usize> Second<N> {
     }
 }
 
-/// The knots on a grid so dense that the limits hold between its points as well, but for little.
+/// The knots on a grid so dense that the limits hold between its points as well, except for a small excess.
 fn second_order<const N: usize>(path: &Path<N>, bounds: &Bounds<N>, second: Second<N>) -> Vec<Knot<[f64; N]>> {
     let mut knots = second.knots();
     let excess = |knots: &[Knot<[f64; N]>]| knots.windows(2).map(|pair| slower(used(pair, bounds))).fold(1.0, f64::max);
@@ -233,7 +233,7 @@ fn second_order<const N: usize>(path: &Path<N>, bounds: &Bounds<N>, second: Seco
     knots
 }
 
-/// The path within limits of jerk, too; none where no profile was found.
+/// The path timed within limits of jerk, too; `None` where no profile was found.
 fn third<const N: usize>(
     path: &Path<N>,
     bounds: &Bounds<N>,
@@ -267,7 +267,7 @@ fn third<const N: usize>(
     best.map(|(_, knots)| knots)
 }
 
-/// The points at which the third order is solved: close in time, close to each other near rest, and one wherever a segment ends.
+/// The points at which the third order is solved: close in time, closer near rest, and one at the end of each segment.
 fn mesh<const N: usize>(path: &Path<N>, bounds: &Bounds<N>, second: &Second<N>) -> Mesh<N> {
     let whole = path.length();
     let lasts = second.times[second.times.len() - 1];
@@ -296,7 +296,7 @@ fn mesh<const N: usize>(path: &Path<N>, bounds: &Bounds<N>, second: &Second<N>) 
     for (i, (segment, start)) in segments.iter().zip(path.breaks()).enumerate() {
         let from = if i == 0 { first } else { start };
         let to = if i + 1 == segments.len() { whole - end } else { start + segment.length };
-        // How many cells there are up to each of many points.
+        // The number of cells up to each of many points.
         let mut counted = vec![(from, 0.0)];
         let (mut at, mut cells) = (from, 0.0);
         while at < to {
@@ -329,7 +329,7 @@ fn mesh<const N: usize>(path: &Path<N>, bounds: &Bounds<N>, second: &Second<N>) 
     Mesh { s, ends }
 }
 
-/// Times and positions of the knots: all points of the mesh, and more of them in the first and the last cell.
+/// Times and positions of the knots: all points of the mesh, and additional ones in the first and the last cell.
 fn timed<const N: usize>(path: &Path<N>, mesh: &Mesh<N>, x: &[f64], u: &[f64]) -> (Vec<f64>, Vec<[f64; N]>) {
     let n = mesh.s.len() - 1;
     let cell = |k: usize| mesh.s[k + 1] - mesh.s[k];
@@ -355,7 +355,7 @@ fn timed<const N: usize>(path: &Path<N>, mesh: &Mesh<N>, x: &[f64], u: &[f64]) -
     (times, positions)
 }
 
-/// ∫ ds / √x over a cell in which x is a quadratic, by Gauss and Legendre's rule of five points.
+/// ∫ ds / √x over a cell in which x is quadratic, by the Gauss-Legendre rule with five points.
 fn lasts(cell: f64, x: [f64; 2], u: [f64; 2]) -> f64 {
     const RULE: [(f64, f64); 5] = [
         (0.046_910_077_030_668, 0.118_463_442_528_095),
@@ -371,7 +371,7 @@ fn lasts(cell: f64, x: [f64; 2], u: [f64; 2]) -> f64 {
     cell * RULE.iter().map(|(share, weight)| weight / square(*share).sqrt()).sum::<f64>()
 }
 
-/// How much of its limits a cubic uses: by velocity, acceleration and jerk.
+/// The part of its limits that a cubic uses: velocity, acceleration and jerk.
 fn used<const N: usize>(pair: &[Knot<[f64; N]>], bounds: &Bounds<N>) -> [f64; 3] {
     let mut used = [0.0_f64; 3];
     for j in 0..N {
@@ -383,12 +383,12 @@ fn used<const N: usize>(pair: &[Knot<[f64; N]>], bounds: &Bounds<N>) -> [f64; 3]
     used
 }
 
-/// The factor of time that keeps what uses so much of the limits within them.
+/// The time scaling that brings this use of the limits within them.
 fn slower([velocity, acceleration, jerk]: [f64; 3]) -> f64 {
     velocity.max(acceleration.sqrt()).max(jerk.cbrt()).max(1.0)
 }
 
-/// Draws limits tighter in the cells where the knots break them; gives the factor of time that the knots would need.
+/// Tightens limits in the cells where the knots exceed them; returns the time scaling that the knots would need.
 fn tighten<const N: usize>(knots: &[Knot<[f64; N]>], bounds: &Bounds<N>, limits: &mut Limits<N>) -> f64 {
     let cells = limits.jerks.len();
     let mut excess = 1.0_f64;
@@ -416,7 +416,7 @@ fn tighten<const N: usize>(knots: &[Knot<[f64; N]>], bounds: &Bounds<N>, limits:
     excess
 }
 
-/// Slower by what its cubics break the limits by, if they do.
+/// Slows the motion down by the excess of its cubics over the limits, if there is any.
 fn slowed<const N: usize>(mut knots: Vec<Knot<[f64; N]>>, bounds: &Bounds<N>) -> Vec<Knot<[f64; N]>> {
     let factor = knots.windows(2).map(|pair| slower(used(pair, bounds))).fold(1.0, f64::max);
     if factor > 1.0 {

@@ -1,9 +1,8 @@
-//! When the arm is where: a path becomes a trajectory within the joints' velocity, acceleration and jerk limits.
+//! Time parameterization: a path becomes a trajectory within the joints' velocity, acceleration and jerk limits.
 //!
-//! The corners of a blended section are rounded in several ways: each by itself (`blend`), and all along, more or less closely (`spline`).
-//! What comes out are smooth paths (`path`); the quickest of them is taken, and none of them where stopping at every corner is quicker. How a
-//! path is followed: `follow`. Every section starts and ends at rest, unless both at a seam leave room to pass it without a stop (`seam`)
-//! and the whole is quicker so.
+//! The corners of a blended section are rounded in several ways: each by itself (`blend`), and all together, more or less closely (`spline`). The results
+//! are smooth paths (`path`); the fastest of them is used, or a stop at every corner where that is faster. `follow` times a path. Every section starts
+//! and ends at rest, unless both sections at a seam leave room to pass it without a stop (`seam`) and the whole motion is faster so.
 
 mod blend;
 mod cubics;
@@ -31,38 +30,38 @@ use room::Room;
 use seam::{Loose, joined};
 use spline::{Sides, smoothed, through};
 
-/// The chords for which a curve is asked to be free are at most this far from it, in radians.
+/// Maximum distance between a curve and the chords that are checked for collisions, in radians.
 const SAGITTA_RAD: f64 = 5e-4;
 
-/// A bend that is none, in radians.
+/// A smaller change of direction is not a corner, in radians.
 const STRAIGHT_RAD: f64 = 1e-6;
 
-/// How far apart the control points of a spline are at most, in radians: one spline for each.
+/// Maximum distances between the control points of a spline, in radians: one spline is tried for each.
 const SPACINGS_RAD: [f64; 2] = [0.5, 0.25];
 
-/// A path whose motions are shorter is dense: splines also leave out postures of it. In radians, and how many make one.
+/// A path with shorter motions than this is dense, in radians: splines then also skip postures, by these strides.
 const DENSE_RAD: f64 = 0.15;
 const STRIDES: [usize; 2] = [2, 4];
 
-/// The most candidates that are followed to the end, and how much longer another than the first may take roughly.
+/// Maximum number of candidates that are timed exactly, and how much longer than the best another one may be by estimate.
 const FOLLOWED: usize = 2;
 const CLOSE: f64 = 1.03;
 
-/// A tool that is slower than this, per radian of the joints' way, stands still and limits nothing.
+/// A tool slower than this, per radian of joint motion, stands still and is no limit.
 const STANDS: f64 = 1e-9;
 
-/// How much of a blended section a seam may take at each end: two seams leave the middle.
+/// The part of a blended section that a seam may take at each end: two seams leave the middle.
 const LOOSE_SHARE: f64 = 0.5;
 
 /// How fast a path is followed.
 #[derive(Debug, Clone)]
 pub struct Speed {
-    /// A fraction of the joints' limits of velocity and acceleration; those of jerk hold as they are.
+    /// A fraction of the joints' limits of velocity and acceleration; jerk limits are not scaled.
     share: f64,
     tool: Option<Tool>,
 }
 
-/// What may not be too fast.
+/// A frame whose speed is limited.
 #[derive(Debug, Clone)]
 struct Tool {
     reach: Reach,
@@ -77,15 +76,15 @@ impl From<f64> for Speed {
 }
 
 impl Speed {
-    /// The same, and the frame of `reach` is at most so fast, in metres and in radians per second. That holds at many places of the path and
-    /// nearly between them: [`ToolSpeed::keep`](crate::tool_speed::ToolSpeed::keep) makes it hold everywhere.
+    /// Also limits the speed of the frame of `reach`, in metres and in radians per second. The limit holds at many points of the path and approximately
+    /// between them: [`ToolSpeed::keep`](crate::tool_speed::ToolSpeed::keep) makes it hold everywhere.
     pub fn with_tool(self, reach: &Reach, limits: [f64; 2]) -> Speed {
         Speed { tool: Some(Tool { reach: reach.clone(), limits }), ..self }
     }
 }
 
 impl Tool {
-    /// How many times as fast as with these velocities the joints may be.
+    /// The factor by which these joint velocities may be multiplied.
     fn fastest(&self, positions: &JointVector, velocities: &JointVector) -> f64 {
         let speeds = self.reach.speeds(positions, velocities);
         (0..2).map(|k| self.limits[k] / speeds[k].max(STANDS)).fold(f64::INFINITY, f64::min)
@@ -95,18 +94,18 @@ impl Tool {
 /// A section of a path.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Section<P = JointVector> {
-    /// Its corners may be blended where nothing is touched.
+    /// Its corners may be blended where that causes no collision.
     Blended(Vec<P>),
-    /// Followed as it is given, from rest to rest: postures close to each other, such as those along a straight line of the tool; or two, for a
-    /// straight motion of the joints.
+    /// Followed exactly, from rest to rest: closely spaced postures, such as those along a straight line of the tool; or two, for a straight joint
+    /// motion.
     AsGiven(Vec<P>),
-    /// As given but for its ends: shares of its way, at its beginning and at its end, that may be left to pass into a neighbour without a stop,
-    /// where nothing is touched.
+    /// Followed exactly except for its ends: shares of its length, at its beginning and at its end, that a seam may replace to pass into a neighbour
+    /// without a stop, where that causes no collision.
     Loose(Vec<P>, [f64; 2]),
 }
 
 impl Section {
-    /// With as many joints as an array has; those that are not there are at zero.
+    /// Padded to the number of joints of an array; the missing ones are zero.
     fn padded<const N: usize>(&self) -> Section<[f64; N]> {
         let all = |path: &[JointVector]| path.iter().map(JointVector::padded).collect();
         match self {
@@ -124,7 +123,7 @@ impl<P: Copy> Section<P> {
         path
     }
 
-    /// The shares of its way that seams may take.
+    /// The shares of its length that seams may take.
     fn loose(&self) -> [f64; 2] {
         match self {
             Section::Blended(_) => [LOOSE_SHARE; 2],
@@ -134,8 +133,8 @@ impl<P: Copy> Section<P> {
     }
 }
 
-/// The trajectory along the sections at a fraction `speed` of the velocity and acceleration limits; those of jerk hold as they are.
-/// Corners are rounded where `is_free` finds the straight motions from point to point of the curve free, and where no joint leaves its range.
+/// The trajectory along the sections at a fraction `speed` of the velocity and acceleration limits; jerk limits are not scaled. Corners are rounded where
+/// `is_free` finds the chords of the curve free, and where no joint leaves its range.
 pub fn parameterise(
     robot: &Robot,
     sections: &[Section],
@@ -145,7 +144,7 @@ pub fn parameterise(
     timed(robot.arm_joints(), sections, speed, is_free).named(robot.arm_joints())
 }
 
-/// As [`parameterise`], for any joints, to the end.
+/// As [`parameterise`], for any joints, without interruption.
 pub fn timed(
     joints: &[Joint],
     sections: &[Section],
@@ -155,8 +154,8 @@ pub fn timed(
     timed_while(joints, sections, speed, is_free, &mut || true)
 }
 
-/// As [`timed`], at any [`Speed`]; where `goes_on`, which is asked several times per millisecond, says no, what has not been rounded yet is followed with
-/// a stop at every corner.
+/// As [`timed`], at any [`Speed`]. When `goes_on`, which is asked several times per millisecond, returns false, corners that have not been rounded yet
+/// are followed with a stop.
 pub fn timed_while(
     joints: &[Joint],
     sections: &[Section],
@@ -165,7 +164,7 @@ pub fn timed_while(
     goes_on: &mut dyn FnMut() -> bool,
 ) -> Curve {
     let speed = speed.into();
-    // What follows computes with arrays of fixed sizes; joints up to the next size stand still at zero.
+    // The computation uses arrays of fixed sizes; joints up to the next size stand still at zero.
     match joints.len() {
         ..=3 => timed_as::<3>(joints, sections, speed, is_free, goes_on),
         4..=7 => timed_as::<7>(joints, sections, speed, is_free, goes_on),
@@ -227,20 +226,20 @@ fn knots<const N: usize>(
     knots
 }
 
-/// To the last bit.
+/// Ends exactly at the section's last posture.
 fn end_at<const N: usize>(knots: &mut [Knot<[f64; N]>], section: &Section<[f64; N]>) {
     if let (Some(knot), Some(end)) = (knots.last_mut(), section.path().last()) {
         knot.positions = *end;
     }
 }
 
-/// Smooth pieces from rest to rest, and what they are followed by.
+/// Smooth pieces from rest to rest, and their knots.
 struct Way<const N: usize> {
     pieces: Vec<Path<N>>,
     knots: Vec<Knot<[f64; N]>>,
 }
 
-/// Through all sections, without a stop where that is free and quicker by the estimate; none where every seam stays.
+/// Through all sections, without a stop where that is free and faster by the estimate; `None` where every seam stays.
 fn passing<const N: usize>(
     sections: &[Section<[f64; N]>],
     ways: &[Way<N>],
@@ -263,7 +262,7 @@ fn passing<const N: usize>(
     followed(&pieces, bounds, goes_on).filter(|knots| room.holds_motion(knots))
 }
 
-/// Along postures as they are, or with a stop at each of them if there is no time for more.
+/// Through the postures exactly, or with a stop at each of them if there is no time for more.
 fn straight<const N: usize>(path: &[[f64; N]], bounds: &Bounds<N>, goes_on: &mut dyn FnMut() -> bool) -> Way<N> {
     let pieces = through(path);
     match followed(&pieces, bounds, goes_on) {
@@ -272,14 +271,14 @@ fn straight<const N: usize>(path: &[[f64; N]], bounds: &Bounds<N>, goes_on: &mut
     }
 }
 
-/// With a stop at every posture.
+/// Stops at every posture.
 fn stopping<const N: usize>(path: &[[f64; N]], bounds: &Bounds<N>) -> Way<N> {
     let pieces: Vec<Path<N>> = path.windows(2).map(|pair| line(&pair[0], &pair[1])).collect();
     let knots = followed(&pieces, bounds, &mut || true).unwrap_or_default();
     Way { pieces, knots }
 }
 
-/// The quickest way along a path whose corners may be rounded.
+/// The fastest way along a path whose corners may be rounded.
 fn free<const N: usize>(
     path: &[[f64; N]],
     bounds: &Bounds<N>,
@@ -337,7 +336,7 @@ fn lasts_s<const N: usize>(knots: &[Knot<[f64; N]>]) -> f64 {
     knots.last().map_or(0.0, |knot| knot.time_s)
 }
 
-/// Piece after piece, each from rest to rest.
+/// The knots of all pieces, each from rest to rest.
 fn followed<const N: usize>(
     pieces: &[Path<N>],
     bounds: &Bounds<N>,
@@ -350,7 +349,7 @@ fn followed<const N: usize>(
     Some(knots)
 }
 
-/// Begins where the knots end; what comes first there is left out.
+/// Appends knots after the last time; the first one is dropped because it repeats the last.
 fn append<const N: usize>(knots: &mut Vec<Knot<[f64; N]>>, next: Vec<Knot<[f64; N]>>) {
     let begins_s = lasts_s(knots);
     let skipped = usize::from(!knots.is_empty());

@@ -1,28 +1,28 @@
-//! A smooth path: polynomials of degree five at most, one after the other, along a parameter s that is about the way travelled.
+//! A smooth path: a sequence of polynomials of degree five or less in a parameter s, which is approximately the distance travelled.
 //!
-//! Value, first and second derivative are continuous; the third may jump where one polynomial ends. The first derivative is
-//! nowhere zero. A path says where to go, not when; it is followed from rest to rest.
+//! Value, first and second derivative are continuous; the third may jump between polynomials. The first derivative is never zero. A path has no
+//! timing; it is followed from rest to rest.
 
-/// The coefficients of a polynomial: those of s⁰ to s⁵.
+/// Number of coefficients of a polynomial: those of s⁰ to s⁵.
 const COEFFICIENTS: usize = 6;
 
 /// A path of `N` joints from rest to rest.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Path<const N: usize> {
     segments: Vec<Segment<N>>,
-    /// Where each segment begins.
+    /// The s at which each segment begins.
     starts: Vec<f64>,
     length: f64,
 }
 
-/// One polynomial, from s = 0 at its beginning.
+/// A polynomial, with s = 0 at its beginning.
 #[derive(Debug, Clone)]
 pub(crate) struct Segment<const N: usize> {
     pub(crate) length: f64,
     coefficients: [[f64; N]; COEFFICIENTS],
 }
 
-/// Position and three derivatives by s.
+/// Position and three derivatives with respect to s.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Derivatives<const N: usize> {
     pub(crate) position: [f64; N],
@@ -41,7 +41,7 @@ impl<const N: usize> Segment<N> {
         Segment { length, coefficients }
     }
 
-    /// A Bézier curve of degree five at most along a parameter from 0 to `length`.
+    /// A Bézier curve of degree five or less, with a parameter from 0 to `length`.
     pub(crate) fn bezier(controls: &[[f64; N]], length: f64) -> Segment<N> {
         let degree = controls.len() - 1;
         let mut coefficients = [[0.0; N]; COEFFICIENTS];
@@ -58,7 +58,7 @@ impl<const N: usize> Segment<N> {
         Segment { length, coefficients }
     }
 
-    /// A quintic that begins and ends with the positions and the first two derivatives of others, along a parameter from 0 to `length`.
+    /// A quintic with the given positions and first two derivatives at both ends, with a parameter from 0 to `length`.
     pub(crate) fn between(from: &Derivatives<N>, to: &Derivatives<N>, length: f64) -> Segment<N> {
         let fifth = length / 5.0;
         let bend = length * length / 20.0;
@@ -73,7 +73,7 @@ impl<const N: usize> Segment<N> {
     /// The part of it from one s to another.
     fn part(&self, from: f64, to: f64) -> Segment<N> {
         let mut coefficients = self.coefficients;
-        // Taylor's shift: Horner's scheme again and again.
+        // Taylor shift by repeated Horner schemes.
         for low in 0..COEFFICIENTS - 1 {
             for k in (low..COEFFICIENTS - 1).rev() {
                 coefficients[k] = std::array::from_fn(|j| coefficients[k][j] + from * coefficients[k + 1][j]);
@@ -95,7 +95,7 @@ impl<const N: usize> Segment<N> {
         Segment { length, coefficients }
     }
 
-    /// What it is at s, counted from its beginning.
+    /// Its value and derivatives at s, counted from its beginning.
     pub(crate) fn at(&self, s: f64) -> Derivatives<N> {
         let [c0, c1, c2, c3, c4, c5] = &self.coefficients;
         let of = |f: &dyn Fn(usize) -> f64| std::array::from_fn(f);
@@ -107,7 +107,7 @@ impl<const N: usize> Segment<N> {
         }
     }
 
-    /// A range that joint `j` does not leave: that of the points of its Bézier form.
+    /// A range that joint `j` does not leave: that of its Bézier control points.
     pub(crate) fn hull(&self, j: usize) -> [f64; 2] {
         const CHOOSE: [[f64; COEFFICIENTS]; COEFFICIENTS] = [
             [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -140,33 +140,34 @@ impl<const N: usize> Segment<N> {
         self.coefficients[2..].iter().all(|c| c.iter().all(|v| *v == 0.0))
     }
 
-    /// About the greatest length of the second derivative.
+    /// The approximate maximum length of the second derivative.
     pub(crate) fn sharpest(&self) -> f64 {
         let samples = if self.is_straight() { 0 } else { 8 };
         let bends = (0..=samples).map(|i| norm(&self.at(self.length * i as f64 / samples.max(1) as f64).second));
         bends.fold(0.0, f64::max)
     }
 
-    /// Points so close to each other that the chords between them are at most `sagitta` off the curve; both ends are among them.
+    /// Points so close that the chords between them are at most `sagitta` from the curve; both ends are included.
     pub(crate) fn points(&self, sagitta: f64) -> Vec<[f64; N]> {
         let count = (self.length * (self.sharpest() / (8.0 * sagitta)).sqrt()).ceil().clamp(1.0, 64.0);
         (0..=count as usize).map(|i| self.at(self.length * i as f64 / count).position).collect()
     }
 }
 
-/// What a polynomial is at s.
+/// The value of a polynomial at s.
 fn value(coefficients: &[f64], s: f64) -> f64 {
     coefficients.iter().rev().fold(0.0, |sum, c| sum * s + c)
 }
 
-/// Its derivative.
+/// The derivative of a polynomial.
 fn slope(coefficients: &[f64]) -> Vec<f64> {
     coefficients.iter().enumerate().skip(1).map(|(k, c)| k as f64 * c).collect()
 }
 
-/// Where it changes its sign from 0 to `to`: between any two neighbouring extremes, which are where its derivative does, it does so once at most.
+/// The sign changes of a polynomial from 0 to `to`. Between two neighbouring extremes, which are sign changes of its derivative, there is at most
+/// one.
 fn zeros(coefficients: &[f64], to: f64) -> Vec<f64> {
-    /// By so many halves a place is exact to the last bits.
+    /// This many halvings give a zero to the last bits.
     const HALVINGS: usize = 52;
     if coefficients.len() < 2 {
         return Vec::new();
@@ -189,7 +190,7 @@ fn zeros(coefficients: &[f64], to: f64) -> Vec<f64> {
     ends.windows(2).filter_map(between).collect()
 }
 
-/// The point a share of the way from one to another.
+/// The point a share of the way from one point to another.
 pub(crate) fn between<const N: usize>(from: &[f64; N], to: &[f64; N], share: f64) -> [f64; N] {
     std::array::from_fn(|j| from[j] + (to[j] - from[j]) * share)
 }
@@ -223,7 +224,7 @@ impl<const N: usize> Path<N> {
         part
     }
 
-    /// What it is at s.
+    /// Its value and derivatives at s.
     pub(crate) fn at(&self, s: f64) -> Derivatives<N> {
         let index = self.starts.partition_point(|start| *start <= s).saturating_sub(1);
         self.segments[index].at(s - self.starts[index])
@@ -234,7 +235,7 @@ impl<const N: usize> Path<N> {
         self.length
     }
 
-    /// Where segments begin and end: s from 0 to the length.
+    /// The ends of segments: s from 0 to the length.
     pub(crate) fn breaks(&self) -> impl Iterator<Item = f64> + '_ {
         self.starts.iter().copied().chain([self.length])
     }

@@ -1,14 +1,14 @@
-//! The quickest way to follow a path within limits of velocity and acceleration: time-optimal path parameterisation by
+//! The fastest way to follow a path within limits of velocity and acceleration: time-optimal path parameterisation by
 //! reachability analysis (Pham and Pham, *A New Approach to Time-Optimal Path Parameterization Based on Reachability Analysis*,
 //! IEEE Transactions on Robotics, 2018).
 //!
-//! Along a grid of s the state is x = ṡ² and the control u = s̈, which is constant between two points: x grows by 2 Δ u. A sweep
-//! backwards finds the greatest x at each point from which rest at the end can be reached, a sweep forwards takes the greatest u
-//! that stays below. The limits of acceleration hold at both ends of every step.
+//! On a grid of s the state is x = ṡ² and the control u = s̈, which is constant between two points: x grows by 2 Δ u. A backward
+//! sweep finds the greatest x at each point from which rest at the end can be reached; a forward sweep takes the greatest u that
+//! stays below. The acceleration limits hold at both ends of every step.
 
 use super::path::Derivatives;
 
-/// What a path asks of the joints at the points of a grid.
+/// The path's derivatives at the points of a grid.
 pub(crate) struct Grid<const N: usize> {
     pub(crate) s: Vec<f64>,
     pub(crate) points: Vec<Derivatives<N>>,
@@ -21,10 +21,10 @@ struct Lines<const N: usize> {
     greatest: f64,
 }
 
-/// Below this share of the others a joint does not move, and does not count.
+/// A joint that moves less than this part of the others' motion is ignored.
 const NEGLIGIBLE: f64 = 1e-9;
 
-/// ṡ² at every point of the grid, zero at both ends; ṡ is at most `fastest` at each.
+/// ṡ² at every point of the grid, zero at both ends; `fastest` is the maximum of ṡ at each point.
 pub(crate) fn squares<const N: usize>(
     grid: &Grid<N>,
     fastest: &[f64],
@@ -70,7 +70,7 @@ impl<const N: usize> Lines<N> {
         Lines { rows, greatest }
     }
 
-    /// The bounds of u that hold at x, the lower and the upper one, each as a line over x: its value at 0 and its slope.
+    /// The active lower and upper bounds of u at x, each as a line over x: its value at 0 and its slope.
     fn bounds(&self, x: f64, step: f64, next: f64) -> ((f64, f64), (f64, f64)) {
         // 0 ≤ x + 2 Δ u ≤ next
         let slope = -0.5 / step;
@@ -89,7 +89,7 @@ impl<const N: usize> Lines<N> {
         (low, high)
     }
 
-    /// The greatest x for which there is a u: where the lower bound of u, which is convex, meets the upper one, which is concave.
+    /// The greatest x for which a u exists: where the lower bound of u, which is convex, meets the upper one, which is concave.
     fn greatest_square(&self, step: f64, next: f64) -> f64 {
         let mut x = self.greatest;
         for _ in 0..4 * N + 8 {
@@ -97,7 +97,7 @@ impl<const N: usize> Lines<N> {
             if low.0 + low.1 * x <= high.0 + high.1 * x + 1e-12 {
                 return x;
             }
-            // The two lines that are crossed here meet at a smaller x; no x beyond that one will do.
+            // The two lines that cross here meet at a smaller x; no greater x is feasible.
             x = ((high.0 - low.0) / (low.1 - high.1)).max(0.0);
         }
         x

@@ -1,9 +1,9 @@
-//! About how long a path of straight motions takes once its corners are rounded: what paths are compared by while they are improved.
-//! It costs a microsecond or so; the exact time costs thousands.
+//! The approximate duration of a path of straight motions after its corners are rounded: the cost by which paths are compared while they
+//! are improved. It takes about a microsecond; the exact duration takes thousands.
 //!
-//! A corner is passed at the speed that its blend allows in the middle, where it bends most; the blend is as wide as `blend` would make it.
-//! From corner to corner the motion is the quickest with the limits along that side. Jerk takes time wherever the acceleration
-//! changes, as in a double S.
+//! A corner is passed at the speed that its blend allows in the middle, where the curvature is greatest; the blend is as wide as `blend`
+//! would make it. Between corners the motion is the fastest within the limits along that side. Jerk takes additional time wherever the
+//! acceleration changes, as in a double S.
 
 use super::blend::{BLEND_HALVINGS, BLEND_RAD, LEAST_RAD, SHARPEST_RAD};
 use crate::mechanism::MAX_JOINTS;
@@ -11,38 +11,39 @@ use crate::robot::Joint;
 use crate::space::{State, difference, length};
 use std::collections::VecDeque;
 
-/// How much of each half of a blend counts as its middle. The ends of a blend hardly bend, so the speed changes there as on the sides.
+/// The part of each half of a blend that counts as its middle. The ends of a blend are nearly straight, so the speed changes there as on
+/// the sides.
 const MIDDLE: f64 = 0.5;
 
-/// A posture closer to the last one than this is passed by, in radians: dense paths are smoothed, not cornered at each posture.
+/// A posture closer to the last one than this is skipped, in radians: dense paths are smoothed, without a corner at each posture.
 const STEP_RAD: f32 = 0.15;
 
-/// The greatest second and third derivative of a blend of half-width 1, over the change of direction.
+/// Maximum second and third derivative of a blend of half-width 1, per change of direction.
 const BEND: f64 = 0.75;
 const JOLT: f64 = 1.5;
 
-/// How far the middle of such a blend is off the corner.
+/// Distance between the middle of such a blend and the corner.
 const OFF: f32 = 0.1875;
 
-/// Corners whose room is remembered: more than a path has.
+/// Number of corners whose blend width is cached: more than a path has.
 const REMEMBERED: usize = 64;
 
-/// What joints may do, as estimates need it.
+/// The joints' limits in the form that estimates need.
 #[derive(Debug, Clone)]
 pub struct Rough {
     joints: usize,
-    /// One over each limit.
+    /// Reciprocals of the limits.
     per_velocity: State,
     per_acceleration: State,
     per_jerk: State,
-    /// Room for the sides of a path, and for what is between them.
+    /// Buffers for the sides of a path, and for the corners between them.
     sides: Vec<Side>,
     corners: Vec<Corner>,
-    /// Where a corner is, the directions before and after it, how wide its blend may be at the most, and how wide it can be.
+    /// Cache of corners: position, the directions before and after, the maximum width of the blend, and its possible width.
     known: VecDeque<([State; 3], [f64; 2])>,
 }
 
-/// A straight motion with its limits along the way.
+/// A straight motion with its limits along the path.
 #[derive(Debug, Clone, Copy)]
 struct Side {
     from: State,
@@ -53,7 +54,7 @@ struct Side {
     jerk: f64,
 }
 
-/// How fast a corner can be passed, and for how much of the way on either side. The ends of a path are corners, too.
+/// The speed at a corner, and the distance on either side over which it holds. The ends of a path are corners, too.
 #[derive(Debug, Clone, Copy, Default)]
 struct Corner {
     speed: f64,
@@ -77,7 +78,7 @@ impl Rough {
         }
     }
 
-    /// About how long a path takes from rest to rest, in seconds, with room for every blend.
+    /// The approximate duration of a path from rest to rest, in seconds, if every blend has room.
     pub fn duration_s(&mut self, path: &[State]) -> f64 {
         self.read(path);
         self.limit_corners(&mut |_, _, width| width);
@@ -105,7 +106,7 @@ impl Rough {
     }
 
     fn lasts_s(&self) -> f64 {
-        // A double S's phase of a change in speed begins and ends with a change of acceleration, which takes time, too.
+        // A change of speed in a double S begins and ends with a change of acceleration, which takes time, too.
         let (mut lasts, mut pressed) = (0.0, 0.0);
         let mut press = |to: f64, jerk: f64| {
             let changes = (to - pressed).abs() / (2.0 * jerk);
@@ -116,7 +117,7 @@ impl Rough {
             let (from, to) = (ends[0].speed, ends[1].speed);
             let run = side.run(ends);
             let peak = side.peak(from, to, run, side.acceleration);
-            // With jerk, changes take as long as with less acceleration.
+            // With jerk limits a change of speed takes as long as with less acceleration.
             let change = peak - from.min(to);
             let mean = side.acceleration.min(change / side.changes_in(change).max(1e-12)).max(1e-12);
             let peak = side.peak(from, to, run, mean);
@@ -137,7 +138,7 @@ impl Rough {
         lasts + self.sides.last().map_or(0.0, |side| press(0.0, side.jerk))
     }
 
-    /// The speed at each corner: what the blend allows, and what the sides allow from corner to corner.
+    /// The speed at each corner: limited by the blend, and by the sides from corner to corner.
     fn limit_corners(&mut self, width_at: &mut dyn FnMut(&Side, &Side, f64) -> f64) {
         let (sides, corners) = (&self.sides, &mut self.corners);
         corners.clear();
@@ -190,35 +191,35 @@ impl Rough {
 }
 
 impl Side {
-    /// Its way between the middles of its corners.
+    /// Its length between the middles of its corners.
     fn run(&self, ends: &[Corner]) -> f64 {
         self.length - ends[0].half - ends[1].half
     }
 
-    /// The greatest speed at its other end.
+    /// The maximum speed at its other end.
     fn reached_from(&self, speed: f64, ends: &[Corner]) -> f64 {
         (speed * speed + 2.0 * self.acceleration * self.run(ends)).sqrt()
     }
 
-    /// The greatest speed between two speeds at its ends.
+    /// The maximum speed between two given speeds at its ends.
     fn peak(&self, from: f64, to: f64, run: f64, acceleration: f64) -> f64 {
         let reached = (acceleration * run + (from * from + to * to) / 2.0).sqrt();
         reached.min(self.velocity).max(from).max(to)
     }
 
-    /// The greatest acceleration in a change of speed.
+    /// The maximum acceleration during a change of speed.
     fn hardest(&self, change: f64) -> f64 {
         self.acceleration.min((change.max(0.0) * self.jerk).sqrt())
     }
 
-    /// How long a change of speed takes from no acceleration to none.
+    /// Duration of a change of speed, from zero acceleration to zero acceleration.
     fn changes_in(&self, change: f64) -> f64 {
         let hardest = self.hardest(change);
         change / hardest.max(1e-12) + hardest / self.jerk
     }
 }
 
-/// How wide the blend of a corner can be, by halves; zero where there is no room.
+/// The possible width of a corner's blend, by halving; zero where there is no room.
 fn width(before: &Side, after: &Side, most: f64, is_free: &mut dyn FnMut(&State, &State) -> bool) -> f64 {
     let mut width = most;
     for _ in 0..=BLEND_HALVINGS {

@@ -1,15 +1,15 @@
 //! Passes from one section of a path into the next without stopping, where both leave room for it: the ends on both sides of the seam are
-//! cut off, and a quintic takes their place that goes on with the position, the direction and the bend of either side.
+//! cut off and replaced by a quintic with the same position, direction and curvature at both ends.
 
 use super::blend::{LEAST_RAD, SHARPEST_RAD, is_free_along};
 use super::follow::{Bounds, estimate};
 use super::path::{Path, Segment, norm};
 use super::room::Room;
 
-/// How often what is cut off is halved before the arm stops at the seam instead.
+/// Number of halvings of the cut width before the arm stops at the seam instead.
 const HALVINGS: usize = 4;
 
-/// What is left of a segment that is cut is at least this share of the width.
+/// What remains of a segment that is cut is at least this part of the width.
 const CRUMB_SHARE: f64 = 0.1;
 
 /// A smooth path, and how much of it a seam may take at its beginning and at its end, in radians.
@@ -19,7 +19,7 @@ pub(crate) struct Loose<const N: usize> {
     pub(crate) ends: [f64; 2],
 }
 
-/// The pieces of one section after the other, from rest to rest each, with fewer stops between the sections. None where every seam stays.
+/// The pieces of all sections in order, each from rest to rest, with fewer stops between the sections. `None` where every seam stays.
 pub(crate) fn joined<const N: usize>(
     sections: &[Vec<Loose<N>>],
     bounds: &Bounds<N>,
@@ -43,7 +43,7 @@ pub(crate) fn joined<const N: usize>(
     joins.then(|| pieces.into_iter().map(|piece| piece.path).collect())
 }
 
-/// Two pieces as one: of the widths that are free the one that is quickest by the estimate, if that is quicker than to stop.
+/// Joins two pieces: among the widths that are free, the fastest by estimate, if it is faster than a stop.
 fn across<const N: usize>(
     before: &Loose<N>,
     after: &Loose<N>,
@@ -66,7 +66,7 @@ fn across<const N: usize>(
             path.append(after.path.part(goes_on_at, after.path.length()));
             let lasts = estimate(&path, bounds);
             match &best {
-                // Narrower ones only get slower from here on.
+                // Narrower seams only get slower from here on.
                 Some((least, _)) if lasts >= *least => break,
                 None if lasts >= stopping => {}
                 _ => best = Some((lasts, Loose { path, ends: [before.ends[0], after.ends[1]] })),
@@ -77,9 +77,9 @@ fn across<const N: usize>(
     best.map(|(_, whole)| whole)
 }
 
-/// The quintic across a seam, with where the path before it is left and that after it goes on; none where the way leads back.
+/// The quintic across a seam, with the s at which the path before is left and the path after is entered; `None` where the path reverses.
 fn seam<const N: usize>(before: &Path<N>, after: &Path<N>, width: f64) -> Option<(f64, Segment<N>, f64)> {
-    // No segment keeps only a crumb.
+    // No segment is left with only a crumb.
     let crumb = CRUMB_SHARE * width;
     let (out, on) = (before.length() - width, width);
     let left = before.breaks().filter(|b| *b <= out).fold(0.0, f64::max) + crumb;

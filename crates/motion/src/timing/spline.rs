@@ -1,9 +1,10 @@
-//! Rounds a path all along: the cubic B-spline whose control points are the path's postures, and more of them on long motions, so
-//! that a corner is rounded close to itself.
+//! Rounds a path as a whole: the cubic B-spline whose control points are the path's postures, plus further ones on long motions, so
+//! that a corner is rounded only near itself.
 //!
-//! The knots are as far apart as the control points. A span that touches something gets more control points around it, on the
-//! sides of the path, which draws the curve closer to the path; where that does not help the path is cut at the corner, for the
-//! arm to stop. On a straight side the curve is the side. And the cubic spline *through* postures, for those that are to be followed.
+//! The knots are as far apart as the control points. A span that touches something gets more control points around it, on the sides
+//! of the path, which pulls the curve closer to the path; where that does not help, the path is cut at the corner, and the arm stops
+//! there. On a straight side the curve coincides with the side. Also the cubic spline *through* postures, for those that are followed
+//! exactly.
 
 use super::STRAIGHT_RAD;
 use super::blend::{bend_rad, is_free_along};
@@ -12,26 +13,26 @@ use super::room::Room;
 use crate::collision::distance;
 use std::collections::BTreeSet;
 
-/// Rounds in which control points are added before the path is cut.
+/// Number of rounds that add control points before the path is cut.
 const ROUNDS: usize = 4;
 
-/// A kink that the arm does not pass at speed where postures are to be followed as they are, in radians.
+/// A greater kink in postures that are followed exactly makes the arm stop, in radians.
 const KINK_RAD: f64 = 0.2;
 
-/// How far the curve through some of the postures may be from the others, in radians.
+/// Maximum distance of the curve through some of the postures from the others, in radians.
 const OFF_RAD: f64 = 1e-4;
 
-/// What is known of the straight motions of a path.
+/// What is known about the straight motions of a path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Sides {
     /// They are free.
     Free,
-    /// Nothing.
+    /// Nothing is known.
     Unknown,
 }
 
-/// The smooth pieces, with the same ends, control points at most `spacing` apart; `is_free` says whether a straight motion is. None
-/// where a side of the path turns out not to be free.
+/// Smooth pieces with the same ends and with control points at most `spacing` apart; `is_free` tells whether a straight motion is
+/// free. `None` where a side of the path turns out not to be free.
 pub(crate) fn smoothed<const N: usize>(
     path: &[[f64; N]],
     sides: Sides,
@@ -45,14 +46,14 @@ pub(crate) fn smoothed<const N: usize>(
     while let Some(polygon) = polygons.pop() {
         match curved(polygon, sides, &mut known, room, is_free)? {
             Curved::Whole(piece) => pieces.push(piece),
-            // The first of the two is next: it is taken from the end.
+            // The first of the two is processed next, because pieces are taken from the end.
             Curved::Cut([before, after]) => polygons.extend([after, before]),
         }
     }
     Some(pieces)
 }
 
-/// The curve of a polygon, or the two polygons that it has to be cut into.
+/// The curve of a polygon, or the two polygons into which it has to be cut.
 enum Curved<const N: usize> {
     Whole(Path<N>),
     Cut([Vec<[f64; N]>; 2]),
@@ -89,7 +90,7 @@ fn curved<const N: usize>(
         if round == ROUNDS {
             let corner = if bend(*first) > bend(first + 1) { *first } else { first + 1 };
             let can_be_cut = bend(corner) >= STRAIGHT_RAD;
-            // What was added on its sides has no bend.
+            // Points added on its sides are not corners.
             let corner = whole.iter().position(|posture| *posture == polygon[corner]).filter(|_| can_be_cut)?;
             return Some(Curved::Cut([whole[..=corner].to_vec(), whole[corner..].to_vec()]));
         }
@@ -106,7 +107,7 @@ fn curved<const N: usize>(
     None
 }
 
-/// The same path with more postures on it, and none of them twice.
+/// The same path with additional postures, and without duplicates.
 fn divided<const N: usize>(path: &[[f64; N]], spacing: f64) -> Vec<[f64; N]> {
     let mut divided = vec![path[0]];
     for to in &path[1..] {
@@ -118,7 +119,7 @@ fn divided<const N: usize>(path: &[[f64; N]], spacing: f64) -> Vec<[f64; N]> {
     divided
 }
 
-/// The spans of the B-spline. At its ends it is mirrored, so it begins and ends at the polygon's ends, without bend.
+/// The spans of the B-spline. It is mirrored at its ends, so that it begins and ends at the polygon's ends with zero curvature.
 fn spans<const N: usize>(polygon: &[[f64; N]]) -> Vec<Segment<N>> {
     let last = polygon.len() - 1;
     let mut along = vec![0.0];
@@ -126,7 +127,7 @@ fn spans<const N: usize>(polygon: &[[f64; N]]) -> Vec<Segment<N>> {
         along.push(along[i] + distance(&pair[0], &pair[1]));
     }
     let whole = along[last];
-    // One beyond each end for the points, two for the knots.
+    // One mirrored point beyond each end, and two knots.
     let mirrored = |end: &[f64; N], inner: &[f64; N]| std::array::from_fn(|j| 2.0 * end[j] - inner[j]);
     let mut points = vec![mirrored(&polygon[0], &polygon[1])];
     points.extend_from_slice(polygon);
@@ -142,7 +143,7 @@ fn spans<const N: usize>(polygon: &[[f64; N]]) -> Vec<Segment<N>> {
     (0..last).map(|i| span(&points[i..i + 4], &knots[i..i + 6])).collect()
 }
 
-/// One span by its four control points and six knots: its Bézier points are the values of the blossom.
+/// A span from its four control points and six knots: its Bézier points are values of the blossom.
 fn span<const N: usize>(controls: &[[f64; N]], knots: &[f64]) -> Segment<N> {
     let [a, b] = [knots[2], knots[3]];
     let blossom = |arguments: [f64; 3]| {
@@ -158,7 +159,7 @@ fn span<const N: usize>(controls: &[[f64; N]], knots: &[f64]) -> Segment<N> {
     Segment::bezier(&[blossom([a, a, a]), blossom([a, a, b]), blossom([a, b, b]), blossom([b, b, b])], b - a)
 }
 
-/// The cubic splines through the postures, cut at kinks; through as few of the postures as keep close to all.
+/// The cubic splines through the postures, cut at kinks; through as few postures as keep close to all of them.
 pub(crate) fn through<const N: usize>(path: &[[f64; N]]) -> Vec<Path<N>> {
     let mut runs = vec![vec![path[0]]];
     for (i, posture) in path.iter().enumerate().skip(1) {
@@ -177,7 +178,7 @@ pub(crate) fn through<const N: usize>(path: &[[f64; N]]) -> Vec<Path<N>> {
         .collect()
 }
 
-/// The natural cubic spline through every so many postures, if it is close to the others.
+/// The natural cubic spline through every `stride`-th posture, if it is close to the others.
 fn thinned<const N: usize>(run: &[[f64; N]], stride: usize) -> Option<Path<N>> {
     let last = run.len() - 1;
     let mut along = vec![0.0];

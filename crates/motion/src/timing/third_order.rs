@@ -1,57 +1,57 @@
-//! The quickest way to follow a path within limits of velocity, acceleration *and jerk*.
+//! The fastest way to follow a path within limits of velocity, acceleration *and jerk*.
 //!
-//! As for the second order (`reachability`) x = ṡ² is wanted over s, here as a quadratic spline, so that u = s̈ is continuous and
-//! s⃛ = u′ √x. With q′, q″, q‴ of the path a joint's acceleration q′ u + q″ x is linear in x and u, and its jerk is
-//! √x (q′ u′ + 3 q″ u + q‴ x). So minimising ∫ ds / √x is a convex problem but for the one root, 1 / √x ≥ |q′ u′ + 3 q″ u + q‴ x| / J,
-//! which is replaced by its tangent at each step: what holds for the tangent holds for the root. It is solved by a logarithmic
-//! barrier and Newton's method (Boyd and Vandenberghe, *Convex Optimization*, chapter 11; Verscheure and others, *Time-Optimal Path
-//! Tracking for Robots: a Convex Optimization Approach*, 2009, for the second order). Every step stays within all limits; the
-//! Hessian has five diagonals, so a step takes time proportional to the points.
+//! As in the second order (`reachability`), the unknown is x = ṡ² over s, here as a quadratic spline, so that u = s̈ is continuous and
+//! s⃛ = u′ √x. With the path's derivatives q′, q″, q‴ a joint's acceleration q′ u + q″ x is linear in x and u, and its jerk is √x (q′
+//! u′ + 3 q″ u + q‴ x). So minimising ∫ ds / √x is a convex problem except for the root in 1 / √x ≥ |q′ u′ + 3 q″ u + q‴ x| / J, which
+//! is replaced by its tangent in each step: what satisfies the tangent satisfies the root. It is solved by a logarithmic barrier and
+//! Newton's method (Boyd and Vandenberghe, *Convex Optimization*, chapter 11; Verscheure and others, *Time-Optimal Path Tracking for
+//! Robots: a Convex Optimization Approach*, 2009, for the second order). Every step stays within all limits; the Hessian has five
+//! diagonals, so the time of a step is proportional to the number of points.
 //!
-//! At rest x is no polynomial of s: in the first and in the last cell s⃛ is constant instead, s = s⃛ t³ / 6, so x = 1.5 u s.
+//! At rest x is not a polynomial of s: in the first and in the last cell s⃛ is constant instead, s = s⃛ t³ / 6, so x = 1.5 u s.
 
 use super::path::Derivatives;
 
-/// A cell of the mesh: from one point to the next, inside one segment of the path.
+/// The cells of the mesh: each from one point to the next, inside one segment of the path.
 pub(crate) struct Mesh<const N: usize> {
-    /// From 0 to the path's length; at least five.
+    /// From 0 to the path's length; at least five points.
     pub(crate) s: Vec<f64>,
-    /// At the beginning and at the end of each cell, as seen from there.
+    /// The path's derivatives at the beginning and at the end of each cell, as seen from inside the cell.
     pub(crate) ends: Vec<[Derivatives<N>; 2]>,
 }
 
 /// Limits of the joints in each cell of a mesh.
 #[derive(Debug, Clone)]
 pub(crate) struct Limits<const N: usize> {
-    /// Of ṡ, at both ends of each cell.
+    /// Maximum of ṡ, at both ends of each cell.
     pub(crate) fastest: Vec<[f64; 2]>,
     pub(crate) velocities: Vec<[f64; N]>,
     pub(crate) accelerations: Vec<[f64; N]>,
     pub(crate) jerks: Vec<[f64; N]>,
 }
 
-/// x and u at the points of the mesh but for the first and last, where both are zero.
+/// x and u at the points of the mesh; at the first and the last both are zero.
 pub(crate) struct Profile {
     pub(crate) x: Vec<f64>,
     pub(crate) u: Vec<f64>,
-    /// The coefficients that are free.
+    /// The free coefficients.
     c: Vec<f64>,
 }
 
 /// The weight of time grows by this factor, from the first value to the last.
 const SHARPEN: f64 = 12.0;
 const FIRST_WEIGHT: f64 = 300.0;
-/// What is given away by the barrier is about the number of limits that bind over this weight, in seconds.
+/// The loss through the barrier is about the number of active limits divided by this weight, in seconds.
 const LAST_WEIGHT: f64 = 1.2e5;
-/// Newton steps for one weight at the most, and the decrement that ends them.
+/// Maximum number of Newton steps per weight, and the decrement that ends them.
 const STEPS: usize = 14;
 const DECREMENT: f64 = 2.0;
-/// How much of what the limits allow is used at first.
+/// The part of the limits that the initial profile uses.
 const WITHIN: f64 = 0.9;
-/// A step goes so far towards the nearest limit at the most.
+/// Maximum length of a step, as a part of the distance to the nearest limit.
 const SHORT_OF: f64 = 0.97;
 
-/// One end of a cell, with its functionals of the three coefficients before, at and after the cell.
+/// One end of a cell, with x, u and u′ there as linear functions of the three coefficients before, at and after the cell.
 struct Place<const N: usize> {
     /// The index of the first of the three coefficients.
     first: usize,
@@ -62,22 +62,22 @@ struct Place<const N: usize> {
     greatest: f64,
     accelerations: [f64; N],
     jerks: [f64; N],
-    /// Half of the way to the neighbours that this end stands for.
+    /// The distance that this end represents: half of the way to its neighbours.
     share: f64,
 }
 
 struct Problem<const N: usize> {
     places: Vec<Place<N>>,
     coefficients: usize,
-    /// The first and the last coefficient as a share of their neighbours.
+    /// The first and the last coefficient as multiples of their neighbours.
     ties: [f64; 2],
 }
 
 /// x, u and u′ at a place.
 type Triple = [f64; 3];
 
-/// The quickest profile; none where the search has no place to begin. It begins with what a profile for wider
-/// limits was made of. `goes_on` is asked in every step; none is the answer where it does not.
+/// The fastest profile; `None` without a feasible start. The search starts from `wider`, the profile for wider limits, where there is
+/// one. `goes_on` is asked in every step; `None` where it returns false.
 pub(crate) fn quickest<const N: usize>(
     mesh: &Mesh<N>,
     limits: &Limits<N>,
@@ -108,7 +108,7 @@ pub(crate) fn quickest<const N: usize>(
     Some(profile)
 }
 
-/// The shape of a profile, if not its height.
+/// The shape of an initial profile, apart from its scale.
 fn slow<const N: usize>(mesh: &Mesh<N>) -> Vec<f64> {
     let n = mesh.s.len() - 1;
     let whole = mesh.s[n];
@@ -124,7 +124,7 @@ impl<const N: usize> Problem<N> {
         let s = &mesh.s;
         let n = s.len() - 1;
         let cell = |k: usize| s[k + 1] - s[k];
-        // The cells beside the two special ones end at a knot with all multiplicity.
+        // The cells beside the two special ones end at a knot with full multiplicity.
         let width = |k: usize| if k == 0 || k == n - 1 { 0.0 } else { cell(k) };
         let first = cell(0);
         let last = cell(n - 1);
@@ -146,7 +146,7 @@ impl<const N: usize> Problem<N> {
                 for j in 0..N {
                     greatest = greatest.min((limits.velocities[k][j] / path.first[j].abs().max(1e-12)).powi(2));
                 }
-                // From rest: jerk is q′ s⃛ about the end, and x there follows from s⃛ and the way.
+                // Starting from rest the jerk is about q′ s⃛, and x there follows from s⃛ and the distance.
                 for (edge, at, way) in [(1, 0, first), (n - 1, n - 1, last)] {
                     if k + end == edge {
                         let slope = &mesh.ends[at][usize::from(at > 0)].first;
@@ -180,7 +180,7 @@ impl<const N: usize> Problem<N> {
         full
     }
 
-    /// A profile, so much slower that it is well within all limits.
+    /// Scales a profile down until it is well within all limits.
     fn within(&self, mut free: Vec<f64>) -> Option<Vec<f64>> {
         let full = self.full(&free);
         let mut scale = f64::INFINITY;
@@ -234,7 +234,7 @@ impl<const N: usize> Problem<N> {
         Some(())
     }
 
-    /// How far along a step the limits that are linear allow to go, at most 1.
+    /// How far along a step the linear limits allow to go, at most 1.
     fn room(&self, full: &[f64], way: &[f64]) -> f64 {
         let mut room = 1.0 / SHORT_OF;
         for (c, d) in full.iter().zip(way) {
@@ -257,7 +257,7 @@ impl<const N: usize> Problem<N> {
         room.max(0.0)
     }
 
-    /// Weighted time and barriers; infinite where a limit is broken.
+    /// Weighted time plus barriers; infinite where a limit is broken.
     fn merit(&self, full: &[f64], weight: f64) -> f64 {
         let mut sum = 0.0;
         for c in full {
@@ -292,7 +292,8 @@ impl<const N: usize> Problem<N> {
         sum
     }
 
-    /// The gradient by the free coefficients, and the five diagonals of the convex part of the Hessian: on, one off, two off.
+    /// The gradient with respect to the free coefficients, and the diagonals of the convex part of the Hessian: the main one, the
+    /// first and the second beside it.
     fn model(&self, full: &[f64], weight: f64) -> (Vec<f64>, Vec<[f64; 3]>) {
         let count = self.coefficients;
         let mut gradient = vec![0.0; count];
@@ -323,7 +324,7 @@ impl<const N: usize> Problem<N> {
         self.fold(&gradient, &bands)
     }
 
-    /// Without the first and the last coefficient, which follow their neighbours.
+    /// Eliminates the first and the last coefficient, which depend on their neighbours.
     fn fold(&self, gradient: &[f64], bands: &[[f64; 3]]) -> (Vec<f64>, Vec<[f64; 3]>) {
         let n = self.coefficients;
         let mut g = gradient[1..n - 1].to_vec();
@@ -354,12 +355,12 @@ impl<const N: usize> Place<N> {
         self.path[0][j] * u + self.path[1][j] * x
     }
 
-    /// Jerk over √x.
+    /// Jerk divided by √x.
     fn jerk(&self, [x, u, rise]: &Triple, j: usize) -> f64 {
         self.path[0][j] * rise + 3.0 * self.path[1][j] * u + self.path[2][j] * x
     }
 
-    /// Gradient and Hessian of weighted time and barriers by x, u, u′.
+    /// Gradient and Hessian of weighted time and barriers with respect to x, u, u′.
     fn model(&self, triple: &Triple, weight: f64) -> (Triple, [Triple; 3]) {
         let x = triple[0];
         let root = 1.0 / x.sqrt();
@@ -382,7 +383,7 @@ impl<const N: usize> Place<N> {
             let (y, limit) = (self.jerk(triple, j), self.jerks[j]);
             let tangent = 0.5 * limit * root / x;
             for (sign, slack) in [(1.0, limit * root - y), (-1.0, limit * root + y)] {
-                // −∇ of the slack, over it.
+                // −∇ of the slack, divided by it.
                 let by = 1.0 / slack;
                 let d = [(tangent + sign * p3) * by, 3.0 * sign * p2 * by, sign * p1 * by];
                 for r in 0..3 {
@@ -400,7 +401,7 @@ impl<const N: usize> Place<N> {
     }
 }
 
-/// −H⁻¹ g by L D Lᵀ; none where H is not positive definite.
+/// −H⁻¹ g by L D Lᵀ; `None` where H is not positive definite.
 fn solved(gradient: &[f64], mut bands: Vec<[f64; 3]>) -> Option<Vec<f64>> {
     let n = gradient.len();
     let mut step: Vec<f64> = gradient.iter().map(|g| -g).collect();
