@@ -1,19 +1,19 @@
-//! Colours, where somebody sees them: on a terminal, unless `NO_COLOR` says otherwise (<https://no-color.org>).
+//! Colours of terminal output, unless `NO_COLOR` is set (<https://no-color.org>).
 
 use std::io::IsTerminal;
 
-/// Whether what is written is coloured.
+/// Whether the output is coloured.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct Colours(bool);
 
 impl Colours {
-    /// As standard output and the environment are.
+    /// For standard output.
     pub(crate) fn of_output() -> Colours {
         let is_set = |name: &str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
         Colours::chosen(std::io::stdout().is_terminal(), is_set("NO_COLOR"), !can_paint())
     }
 
-    /// As standard error and the environment are.
+    /// For standard error.
     pub(crate) fn of_errors() -> Colours {
         let is_set = |name: &str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
         Colours::chosen(std::io::stderr().is_terminal(), is_set("NO_COLOR"), !can_paint())
@@ -23,17 +23,17 @@ impl Colours {
         Colours(is_terminal && !unwanted && !is_dumb)
     }
 
-    /// A head.
+    /// For headings.
     pub(crate) fn bold(self, text: &str) -> String {
         self.painted("1", text)
     }
 
-    /// What goes on.
+    /// For what is in progress.
     pub(crate) fn green(self, text: &str) -> String {
         self.painted("32", text)
     }
 
-    /// What waits, or is held up.
+    /// For what waits or is held.
     pub(crate) fn yellow(self, text: &str) -> String {
         self.painted("33", text)
     }
@@ -43,7 +43,7 @@ impl Colours {
     }
 }
 
-/// Whether a terminal takes commands at all.
+/// Whether the terminal understands control sequences.
 pub(crate) fn can_paint() -> bool {
     std::env::var_os("TERM").is_none_or(|term| term != "dumb")
 }

@@ -4,17 +4,16 @@ use crate::fitted::{padded, visible};
 use ratn_model::readable::in_line;
 use std::borrow::Cow;
 
-/// A wider cell moves what stands behind it, instead of all rows.
+/// Maximum width of a column; a wider cell shifts only the rest of its own row.
 const WIDEST: usize = 100;
 
-/// A table with a head.
+/// A table with a heading.
 pub(crate) fn columns<const N: usize>(head: &[&str; N], mut rows: Vec<[String; N]>) -> String {
     rows.insert(0, head.map(str::to_owned));
     aligned(&rows).join("\n")
 }
 
-/// Columns as wide as their widest cell, two spaces apart; the last is as long as it is. What of a cell would do something to a terminal is
-/// written out.
+/// Columns as wide as their widest cell, two spaces apart; the last one is not padded. Control characters in cells are escaped.
 pub(crate) fn aligned(rows: &[impl AsRef<[String]>]) -> Vec<String> {
     let rows: Vec<Vec<Cow<'_, str>>> =
         rows.iter().map(|row| row.as_ref().iter().map(|cell| in_line(cell)).collect()).collect();

@@ -1,32 +1,32 @@
-//! How a command ends when it does not succeed.
+//! How a command ends without success.
 
 use ratn_task_control::NotStarted;
 use ratn_task_control::learn::LearnError;
 use std::fmt;
 use std::process::ExitCode;
 
-/// Why a command did not do what was asked.
+/// Why a command did not do what was requested.
 #[derive(Debug)]
 pub(crate) enum Failure {
     /// Refused before anything was started; the message is complete.
     Refused(String),
-    /// Something went wrong on the way.
+    /// An error occurred during the command.
     Failed(anyhow::Error),
-    /// What was held was lost before the end.
+    /// A resource that was held for the user was lost before the end.
     Lost(String),
-    /// A task ended with an outcome of its own, which its user may have wanted to know.
+    /// A task ended with an outcome other than success or failure.
     Outcome(String),
-    /// A program that was run for the user ended with this code, which is then the command's.
+    /// A program that was run for the user ended with this exit code, which becomes the command's.
     Program(u8),
 }
 
-/// The task ended neither with success nor badly.
+/// The task ended with an outcome of its own.
 const EXIT_CODE_OUTCOME: u8 = 4;
-/// What was held for the user was lost: "try again later", as `sysexits.h` has it.
+/// A held resource was lost: "try again later", as in `sysexits.h`.
 const EXIT_CODE_LOST: u8 = 75;
 
 impl Failure {
-    /// 2 for what was refused, 1 for what failed, 4 for an outcome of a task's own, 75 for what was lost, the program's where one was run.
+    /// 2 for a refusal, 1 for a failure, 4 for a task's own outcome, 75 for a loss, and the program's own code where one was run.
     pub(crate) fn exit_code(&self) -> ExitCode {
         match self {
             Failure::Refused(_) => ExitCode::from(2),

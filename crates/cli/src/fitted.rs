@@ -1,29 +1,28 @@
-//! How much of a text there is room for on a terminal, which breaks lines that are too long. What colours a line takes no room, and characters
-//! of some languages that of two.
+//! Fits text to the size of a terminal, which wraps long lines. Colour codes take no columns, and some characters take two.
 
 use unicode_width::{UnicodeWidthChar, UnicodeWidthStr};
 
-/// How many columns a line takes.
+/// Number of columns of a line.
 pub(crate) fn visible(line: &str) -> usize {
-    // A colour is `ESC [ … m`.
+    // A colour code is `ESC [ … m`.
     let mut parts = line.split('\x1b');
     let first = parts.next().map_or(0, UnicodeWidthStr::width);
     first + parts.map(|part| part.split_once('m').map_or(0, |(_, seen)| seen.width())).sum::<usize>()
 }
 
-/// A text with spaces behind it up to so many columns; one that takes more stays as it is.
+/// Pads a text with spaces to this number of columns; a longer text is unchanged.
 pub(crate) fn padded(text: &str, columns: usize) -> String {
     format!("{text}{}", " ".repeat(columns.saturating_sub(visible(text))))
 }
 
-/// The beginning of a text without colours, in at most so many columns.
+/// The beginning of a text without colours, in at most this many columns.
 pub(crate) fn cut(text: &str, columns: usize) -> String {
     if text.width() <= columns {
         return text.to_owned();
     }
     let mut room = columns;
     let fits = |c: &char| {
-        // The last column is the ellipsis'.
+        // The last column is for the ellipsis.
         let taken = c.width().unwrap_or(0);
         let fits = taken < room;
         room = room.saturating_sub(taken);
@@ -34,18 +33,18 @@ pub(crate) fn cut(text: &str, columns: usize) -> String {
     short
 }
 
-/// How many rows a line of so many columns takes.
+/// Number of rows that a line of this length takes.
 pub(crate) fn rows(length: usize, width: usize) -> usize {
     length.div_ceil(width.max(1)).max(1)
 }
 
-/// Whether there is room for all of a text, with the last row free.
+/// Whether a whole text fits, with the last row left free.
 pub(crate) fn fits(text: &str, width: usize, height: usize) -> bool {
     text.lines().map(|line| rows(visible(line), width)).sum::<usize>() < height.max(1)
 }
 
-/// The first lines of a text, as many as there is room for, and how many more there are. The last row stays free, so that the end of the last
-/// line moves nothing out of the terminal.
+/// As many of the first lines of a text as fit, and how many more there are. The last row stays free, so that the end of the last line does
+/// not scroll the terminal.
 pub(crate) fn fitted(text: &str, width: usize, height: usize) -> String {
     if fits(text, width, height) {
         return text.to_owned();
@@ -62,7 +61,7 @@ pub(crate) fn fitted(text: &str, width: usize, height: usize) -> String {
     shown.join("\n")
 }
 
-/// The beginning of a long text, and how much more there is of it.
+/// The beginning of a long text, and how many characters are left out.
 pub(crate) fn shortened(text: &str, most: usize, where_all_is: &str) -> String {
     let all = text.chars().count();
     if all <= most {
@@ -112,7 +111,7 @@ mod tests {
         let text = "1\n2\n3\n4\n5";
         assert_eq!(fitted(text, 80, 6), text);
         assert_eq!(fitted(text, 80, 5), "1\n2\n3\n… and 2 more lines: there is no room for them");
-        // A line that is broken takes several rows, as does what is said of the others.
+        // A wrapped line takes several rows, and so does the message about the others.
         assert_eq!(fitted("a\nbbbbbbbbbbbb\nc\nd", 6, 3), "… and 4 more lines: there is no room for them");
         assert_eq!(
             fitted("a\nb\nc\nd\ne\nf\ng\nh\ni\nj\nk", 40, 6),

@@ -1,21 +1,22 @@
-//! Reading what a user names: task files and configs, which are small and are files.
+//! Reads files that a user names: task files and configs, which are small regular files.
 
 use ratn_model::load::MAX_SOURCE;
 use std::path::Path;
 
-/// The text of a file. A device or a pipe, which might never end, and what is too long for a task file are refused.
+/// The text of a file. A device or a pipe, which might never end, is refused, and so is a file that is too long for
+/// a task file.
 pub(crate) fn read(path: &Path) -> std::io::Result<String> {
     ratn_regular_file::read_text(path, MAX_SOURCE)
 }
 
-/// Libraries stand beside the files that use them.
+/// Libraries are found relative to the files that use them.
 pub(crate) struct Libraries;
 
 impl ratn_model::load::Files for Libraries {
     fn read(&self, using: &str, path: &str) -> Result<(String, String), String> {
         let file = Path::new(using).parent().unwrap_or(Path::new("")).join(path);
         let text = read(&file).map_err(|error| error.to_string())?;
-        // Two ways to one file are one file; its name is as short as it can be.
+        // Two paths to one file give one name, which is as short as possible.
         let name = file.canonicalize().unwrap_or(file);
         let here = std::env::current_dir().and_then(|here| here.canonicalize()).unwrap_or_default();
         Ok((name.strip_prefix(here).unwrap_or(&name).display().to_string(), text))
@@ -37,7 +38,7 @@ mod tests {
         let (name, text) = Libraries.read(&using, "parts/a.yaml").unwrap();
         assert_eq!(text, "task: a\n");
         assert_eq!(Libraries.read(&using, "./parts/../parts/a.yaml").unwrap().0, name);
-        // And on from there.
+        // A library is also found from another library.
         assert_eq!(Libraries.read(&name, "a.yaml").unwrap().0, name);
         assert!(Libraries.read(&using, "parts").unwrap_err().contains("not a regular file"));
     }

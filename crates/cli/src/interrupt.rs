@@ -1,6 +1,6 @@
-//! Ctrl-C, SIGTERM and SIGHUP, as something that every part of a command can wait for.
+//! Ctrl-C, SIGTERM and SIGHUP: every part of a command can wait for them.
 //!
-//! The first asks to end in order, the second to end at once, the third ends the process.
+//! The first asks for an orderly end, the second for an immediate one, the third ends the process.
 
 use ratn_task_control::{BackgroundRuntime, Interrupt as Asked};
 use ratn_worker::panic::exit_on_panic;
@@ -19,7 +19,7 @@ pub(crate) struct Interrupt {
 }
 
 impl Interrupt {
-    /// Begins to listen, in a thread of its own: a command that hangs is ended, too.
+    /// Begins to listen in a separate thread, so that a command that hangs can be ended, too.
     ///
     /// # Errors
     /// Where the signals cannot be caught.

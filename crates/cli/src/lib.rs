@@ -1,9 +1,9 @@
-//! The command of the user, as a library so that tests run the same code.
+//! The `ratn` command as a library, so that tests run the same code.
 //!
-//! [`main`] reads the command line and runs one of the commands in `command/`; `system/` starts and finds the other processes. What
-//! runs a task is in `ratn-task-control`, what is made of event logs in `ratn-report`: both are libraries that print nothing.
-//! Results go to stdout, everything else to stderr. Exit code 0 is success, 1 a failure, 2 something refused before anything
-//! was started: a task file, a config or a command line; 4 a task's own outcome.
+//! [`main`] parses the command line and runs one of the commands in `command/`; `system/` starts and finds the other processes.
+//! `ratn-task-control` runs tasks, `ratn-report` evaluates event logs: both are libraries that print nothing. Results go to stdout,
+//! everything else to stderr. Exit code 0 is success, 1 a failure, 2 a refusal before anything was started (of a task file, a config or
+//! a command line), 4 a task's own outcome.
 
 mod arguments;
 mod colour;
@@ -21,8 +21,8 @@ mod system;
 use clap::Parser;
 use std::process::ExitCode;
 
-/// Whether these words, the name of the program first, are a command line that `ratn` takes; otherwise what it says to them. Nothing is
-/// done: the test of the documentation asks about every command that is printed there.
+/// Whether `ratn` accepts these words (the name of the program first) as a command line; otherwise its message. Nothing is executed:
+/// the test of the documentation asks this for every command that is printed there.
 ///
 /// # Errors
 /// The message that a user would see, also for `--help` and `--version`.
@@ -36,7 +36,7 @@ pub fn main() -> ExitCode {
         Ok(arguments) => arguments,
         Err(error) => {
             output::usage(&error);
-            // clap gives 0 to --help and --version and 2 to a usage error, as we want it.
+            // clap returns 0 for --help and --version and 2 for a usage error, as intended.
             return ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(1));
         }
     };
@@ -49,6 +49,6 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// A quarter of what a call costs the resource manager is allocation; with this one it grants half as many again a second.
+/// A quarter of the resource manager's time per call is allocation; with this allocator it grants half as many again per second.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;

@@ -1,8 +1,8 @@
-//! A run while it goes on, from its event log as it grows: on a terminal a few lines that are painted again, for programs the log's lines.
+//! Shows a run in progress from its growing event log: on a terminal as a few repainted lines, for programs as the lines of the log.
 //!
-//! It reads what the run has written, in a thread of its own, so a run is not slower for being watched. What is painted is the one
-//! projection of the log; this file only lays it out. While an operator is asked nothing is painted anew: who types sees what he types
-//! ([`answers`]).
+//! It reads in a separate thread what the run has written, so watching does not slow the run down. What is painted comes from the one
+//! projection of the log; this file only does the layout. While a question to the operator is open nothing is repainted, so that the typed
+//! text stays visible ([`answers`]).
 
 mod answers;
 
@@ -22,19 +22,19 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 const PERIOD: Duration = Duration::from_millis(100);
-/// Instances that have left the window are not shown.
+/// Maximum number of instances that are kept after they have left the window.
 const KEPT: usize = 64;
-/// At most so many lines of what runs, and of what waits.
+/// Maximum number of lines for running and for waiting instances.
 const MOST_RUNNING: usize = 8;
 const MOST_WAITING: usize = 6;
 const BAR: usize = 20;
-/// No terminal has so many columns.
+/// Maximum number of characters of a line: no terminal is wider.
 const MOST_CHARACTERS: usize = 4_096;
 
-/// What is done with a log that grows.
+/// How a growing log is shown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Way {
-    /// Painted on the terminal of standard error.
+    /// Painted on the terminal at standard error.
     Painted,
     /// Each line on standard output.
     Lines,
@@ -48,8 +48,8 @@ pub(crate) struct Live {
 }
 
 impl Live {
-    /// Follows a log that is about to be written. `speed` is the robot's seconds per second.
-    /// What is typed on a terminal answers the questions of the run in `directory`.
+    /// Follows a log that is about to be written. `speed` is the robot's seconds per second. Text typed on a terminal answers the questions of
+    /// the run in `directory`.
     pub(crate) fn follow(log: &Path, way: Way, speed: f64, directory: &Path) -> Live {
         let (end, ends) = channel();
         let log: PathBuf = log.to_owned();
@@ -62,7 +62,7 @@ impl Live {
             let mut tail = Tail::of(&log);
             loop {
                 let is_over = !matches!(ends.recv_timeout(PERIOD), Err(RecvTimeoutError::Timeout));
-                // What cannot be read is reported by whoever writes it, or reads it as a whole afterwards.
+                // Lines that cannot be read are reported by their writer, or when the log is read as a whole afterwards.
                 if !painter.take(tail.more().unwrap_or_default()) || is_over {
                     break;
                 }
@@ -89,12 +89,12 @@ struct Painter {
     speed: f64,
     run: Timeline,
     questions: Questions,
-    /// When the last line came, and its moment.
+    /// When the last line came, and its time in the run.
     heard: (Instant, f64),
 }
 
 impl Painter {
-    /// False once nobody reads.
+    /// Returns false once nobody reads the output.
     fn take(&mut self, lines: Vec<LogLine>) -> bool {
         for line in &lines {
             self.heard = (Instant::now(), line.at.seconds());
@@ -127,7 +127,7 @@ impl Painter {
         let (width, height) = size.map_or((80, 24), |(width, height)| (usize::from(width.0), usize::from(height.0)));
         let path = |id| self.run.instance(id).map_or_else(|| String::from("?"), |one| one.path.to_string());
         let asked = self.questions.lines(path);
-        // The first questions come before what runs and waits: they are what the run stands still for.
+        // Questions come before running and waiting instances, because the run stands still for them.
         let asked = &asked[..asked.len().min(MOST_WAITING).min(height.saturating_sub(4))];
         let mut lines = page(&self.run, width, height - asked.len(), Colours::of_errors());
         lines.extend(asked.iter().map(|line| cut(line, width)));
@@ -135,7 +135,7 @@ impl Painter {
     }
 }
 
-/// A run as it is now, in so many columns and fewer than so many lines.
+/// A page about the run as it is now, within this width and with fewer lines than this height.
 fn page(run: &Timeline, width: usize, height: usize, colours: Colours) -> Vec<String> {
     let room = height.saturating_sub(4).max(1);
     let running = run.running();
@@ -148,7 +148,7 @@ fn page(run: &Timeline, width: usize, height: usize, colours: Colours) -> Vec<St
         lines.push(colours.green(&cut(&text, width)));
     }
     lines.extend(more(running.len(), runs, "run").map(|line| cut(&line, width)));
-    // Who has asked for resources has a cause that can be seen; the others stand behind those.
+    // Instances that have asked for resources have a visible cause; the others come after them.
     let mut waiting: Vec<&Instance> = run.waiting().collect();
     waiting.sort_by_key(|one| (one.stage != Stage::Asking, one.id));
     for sentence in waiting.iter().take(waits).filter_map(|one| run.explain(one.id)) {
@@ -158,7 +158,8 @@ fn page(run: &Timeline, width: usize, height: usize, colours: Colours) -> Vec<St
     lines
 }
 
-/// `fetch_boxes in CDTN mode: 12.3 s  [#####...............] 12 of 35 states have ended; ahead of time: 3 of use (8.0 s), 1 discarded (2.0 s)`
+/// For example `fetch_boxes in CDTN mode: 12.3 s  [#####...............] 12 of 35 states have ended; ahead of time: 3 of use (8.0 s), 1
+/// discarded (2.0 s)`.
 fn head(run: &Timeline) -> String {
     let (ended, known) = (run.count.retired, run.count.expanded - run.count.squashed);
     let full = (BAR * ended).checked_div(known).unwrap_or(0).min(BAR);
@@ -180,9 +181,9 @@ fn more(all: usize, shown: usize, what: &str) -> Option<String> {
     (all > shown).then(|| format!("  and {} more {what}", all - shown))
 }
 
-/// In fewer than so many columns: a line that is broken would not be painted over.
+/// Cuts to fewer columns than the width: a wrapped line would not be painted over.
 fn cut(text: &str, width: usize) -> String {
-    // Of a longer text no more is seen, however wide the terminal is.
+    // More characters than this never fit, however wide the terminal is.
     let end = text.char_indices().nth(MOST_CHARACTERS).map_or(text.len(), |(end, _)| end);
     fitted::cut(&in_line(&text[..end].replace(['\n', '\t'], " ")), width.saturating_sub(1))
 }

@@ -1,7 +1,7 @@
-//! What a command writes: progress for people on standard error, results on standard output.
+//! The output of a command: progress for people on standard error, results on standard output.
 //!
-//! Nothing depends on progress, so a display that is gone or full ends no run. A result that cannot be written is an
-//! error, except when its reader has had enough of it (`ratn report LOG | head`).
+//! Nothing depends on progress output, so a closed or full terminal ends no run. A result that cannot be written is an error, except
+//! when its reader has closed the pipe (`ratn report LOG | head`).
 
 use crate::failure::Failure;
 use crate::fitted::{rows, visible};
@@ -15,16 +15,16 @@ use std::io::{self, ErrorKind, Write};
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
-/// What is said of progress, and how.
+/// The state of progress output.
 static PROGRESS: Mutex<Progress> = Mutex::new(Progress { is_quiet: false, area: Vec::new() });
 
 struct Progress {
     is_quiet: bool,
-    /// How many characters there are in each line at the end of the terminal that is painted again and again.
+    /// The number of characters in each repainted line at the end of the terminal.
     area: Vec<usize>,
 }
 
-/// Writes one line to standard error, if somebody is there to read it: above what is painted there.
+/// Writes a line to standard error, above the painted lines.
 pub(crate) fn progress(line: impl Display) {
     let mut progress = PROGRESS.lock().unwrap_or_else(PoisonError::into_inner);
     if !progress.is_quiet {
@@ -32,13 +32,13 @@ pub(crate) fn progress(line: impl Display) {
     }
 }
 
-/// Why the command did not do what was asked: said also where nothing is said of progress.
+/// Prints why the command failed, even in quiet mode.
 pub(crate) fn failure(failure: &Failure) {
     let mut progress = PROGRESS.lock().unwrap_or_else(PoisonError::into_inner);
     let _ = io::stderr().write_all(said(&mut progress, &failure.to_string()).as_bytes());
 }
 
-/// What is wrong with a command line, or what somebody asked to know of it. In colours, unless a word of it would steer the terminal.
+/// Prints a usage error, or requested help. In colours, unless the text contains characters that would control the terminal.
 pub(crate) fn usage(error: &clap::Error) {
     let plain = error.render().to_string();
     let _ = match readable(&plain) {
@@ -47,17 +47,17 @@ pub(crate) fn usage(error: &clap::Error) {
     };
 }
 
-/// What is written for a message: what others have named, paths too, steers no terminal.
+/// The text of a message, with control characters escaped, because names and paths come from others.
 fn said(progress: &mut Progress, message: &str) -> String {
     format!("{}{}\n", progress.cleared(), readable(message))
 }
 
-/// From now on nothing is said of progress.
+/// Suppresses progress from now on.
 pub(crate) fn be_quiet() {
     PROGRESS.lock().unwrap_or_else(PoisonError::into_inner).is_quiet = true;
 }
 
-/// Paints lines at the end of the terminal of standard error, over those that were painted before.
+/// Paints lines at the end of the terminal at standard error, over the previously painted ones.
 pub(crate) fn paint_area(lines: &[String]) {
     let mut progress = PROGRESS.lock().unwrap_or_else(PoisonError::into_inner);
     let text: String =
@@ -66,7 +66,7 @@ pub(crate) fn paint_area(lines: &[String]) {
     let _ = io::stderr().write_all(text.as_bytes());
 }
 
-/// A line was typed below what is painted, which stands a row higher now.
+/// A line was typed below the painted lines, which have moved up a row.
 pub(crate) fn area_was_pushed() {
     let mut progress = PROGRESS.lock().unwrap_or_else(PoisonError::into_inner);
     if !progress.area.is_empty() {
@@ -74,26 +74,26 @@ pub(crate) fn area_was_pushed() {
     }
 }
 
-/// Takes away what is painted.
+/// Removes the painted lines.
 pub(crate) fn clear_area() {
     paint_area(&[]);
 }
 
 impl Progress {
-    /// What takes away what is painted: up to its first line, and everything from there.
+    /// The control sequence that removes the painted lines: up to the first line, and everything from there.
     fn cleared(&mut self) -> String {
         let area = std::mem::take(&mut self.area);
         if area.is_empty() {
             return String::new();
         }
         let width = terminal_size::terminal_size_of(io::stderr()).map_or(usize::MAX, |(width, _)| usize::from(width.0));
-        // A terminal that has become narrower since breaks those that are longer.
+        // If the terminal has become narrower since, longer lines are wrapped.
         let all: usize = area.iter().map(|length| rows(*length, width)).sum();
         format!("\x1b[{all}A\r\x1b[J")
     }
 }
 
-/// [`progress`], for task control.
+/// Passes task control's messages to [`progress`].
 pub(crate) fn messages() -> Messages {
     Messages::to(|line| progress(format_args!("{line}")))
 }
@@ -104,15 +104,15 @@ pub(crate) fn counted(count: usize, noun: &str) -> String {
     format!("{count} {noun}{plural}")
 }
 
-/// Writes a result and the end of its last line to standard output.
+/// Writes a result and a final newline to standard output.
 ///
 /// # Errors
-/// When it cannot be written. A reader that stopped reading is no error.
+/// When it cannot be written. A reader that has closed the pipe is no error.
 pub(crate) fn result(text: impl Display) -> anyhow::Result<()> {
     write(&mut io::stdout().lock(), &text)
 }
 
-/// As [`result`], for one of many lines: false once nobody reads them any more.
+/// As [`result`], for one of many lines: returns false once nobody reads them any more.
 ///
 /// # Errors
 /// When it cannot be written.
@@ -125,16 +125,16 @@ pub(crate) fn line(text: impl Display) -> anyhow::Result<bool> {
     }
 }
 
-/// Says whether a file could be written, before there is something to write to it; it is not made.
+/// Checks whether a file could be written, before there is anything to write; the file is not created.
 pub(crate) fn check_writable(path: &Path) -> Result<(), Failure> {
-    // `.` in it makes a file that is no directory an error, and is the folder of a bare name.
+    // The appended `.` makes a path below a non-directory an error, and stands for the current folder of a bare name.
     let directory = path.parent().unwrap_or(path).join(".");
     let place = if path.exists() { path } else { &directory };
     let writable = if path.is_dir() { Err(Errno::EISDIR) } else { access(place, AccessFlags::W_OK) };
     writable.map_err(|error| Failure::Refused(format!("ratn: cannot write {}: {}", path.display(), error.desc())))
 }
 
-/// As [`check_writable`], for what is not to take the place of anything: a file with something in it is refused.
+/// As [`check_writable`], for a file that must not replace anything: a file that is not empty is refused.
 pub(crate) fn check_new(path: &Path, help: &str) -> Result<(), Failure> {
     check_writable(path)?;
     match path.metadata() {

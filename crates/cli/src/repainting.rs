@@ -1,5 +1,4 @@
-//! What is shown again whenever it changes: on a terminal in the same place, as much as there is room for, elsewhere one text after the
-//! other.
+//! Output that is shown again whenever it changes: on a terminal in the same place, as much as fits, elsewhere one text after the other.
 
 use crate::colour::can_paint;
 use crate::fitted::fitted;
@@ -7,11 +6,11 @@ use crate::output;
 use std::io::IsTerminal;
 use std::time::Duration;
 
-/// How often it is looked at.
+/// Interval of updates.
 const PERIOD: Duration = Duration::from_millis(500);
 
-/// Shows what `look` says: once, or again whenever it is another text, until nobody reads it any more. On a terminal a text takes the place of
-/// the one before; elsewhere a blank line is between two, and none between lines of JSON.
+/// Shows the text of `look`: once, or again whenever it changes, until nobody reads it any more. On a terminal a text replaces the one before;
+/// elsewhere texts are separated by a blank line, except lines of JSON.
 pub(crate) async fn repeat<E: From<anyhow::Error>>(
     watch: bool,
     json: bool,
@@ -39,7 +38,7 @@ pub(crate) async fn repeat<E: From<anyhow::Error>>(
     }
 }
 
-/// The columns and rows of the terminal of standard output, where it can be painted on. It may have others a moment later.
+/// The columns and rows of the terminal at standard output, where it can be painted on. They may change at any time.
 pub(crate) fn room() -> Option<(usize, usize)> {
     if !std::io::stdout().is_terminal() || !can_paint() {
         return None;

@@ -1,4 +1,4 @@
-//! What those who keep a system running take: stops, states, certificates.
+//! Arguments of the commands that keep a system running: stops, states, certificates.
 
 use clap::{Args, Subcommand};
 use ratn_worker::endpoint::Endpoint;

@@ -1,4 +1,4 @@
-//! What the daemons and the bundled workers take.
+//! Arguments of the daemons and the bundled workers.
 
 use super::systems::FaultArguments;
 use super::values::{place, scene, speed};

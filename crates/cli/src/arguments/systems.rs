@@ -1,4 +1,4 @@
-//! What is said of a whole system: what its cell has, what goes wrong in it, how fast it goes.
+//! Arguments about a whole system: the objects in its cell, injected faults, its speed.
 
 use super::values::{scene, speed};
 use clap::{Args, ValueEnum};

@@ -1,4 +1,4 @@
-//! What is said of tasks: how they are checked, run, steered, reported and simulated, and of planning problems.
+//! Arguments about tasks: checking, running, controlling, reporting and simulating them; and about planning problems.
 
 use super::values::{Due, at_least_one, chart, due, padding, positive, run_share, setting, share, speed};
 use clap::{Args, Subcommand, ValueEnum};

@@ -1,4 +1,4 @@
-//! Words of the command line that have to be of a form.
+//! Parsers of arguments that need a certain form.
 
 use ratn_cell::config::Setting;
 use ratn_worker::session::Standing;
@@ -28,7 +28,7 @@ pub(super) fn speed(text: &str) -> Result<f64, String> {
     }
 }
 
-/// A length that something is grown by.
+/// Padding of shapes, in millimetres.
 pub(super) fn padding(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
     if (0.0..1e3).contains(&value) { Ok(value) } else { Err("expected 0 to 1000 mm".to_owned()) }
@@ -55,7 +55,7 @@ pub(super) fn share(text: &str) -> Result<f64, String> {
     }
 }
 
-/// A run's share of what several need.
+/// A run's share of resources that several runs need.
 pub(super) fn run_share(text: &str) -> Result<f64, String> {
     let (least, most) = (*Standing::SHARES.start(), *Standing::SHARES.end());
     match text.parse::<f64>() {
@@ -64,19 +64,19 @@ pub(super) fn run_share(text: &str) -> Result<f64, String> {
     }
 }
 
-/// When something is due.
+/// A due time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Due {
-    /// So long after it begins.
+    /// This long after the begin.
     After(Duration),
     At(SystemTime),
 }
 
 impl Due {
-    /// Of what begins now.
+    /// The due time of something that begins now.
     ///
     /// # Errors
-    /// An instant that has passed.
+    /// The instant has passed.
     pub(crate) fn from(self, now: SystemTime) -> Result<SystemTime, String> {
         match self {
             Due::After(time) => Ok(now + time),
@@ -86,7 +86,7 @@ impl Due {
     }
 }
 
-/// A run is due within so many seconds: a year.
+/// Maximum time until a run is due, in seconds: a year.
 const LATEST_DUE_S: f64 = 31_536_000.0;
 
 pub(super) fn due(text: &str) -> Result<Due, String> {
@@ -98,7 +98,7 @@ pub(super) fn due(text: &str) -> Result<Due, String> {
     time.map(Due::After).or_else(|| instant(text).map(Due::At)).ok_or_else(|| expected.to_owned())
 }
 
-/// An instant in the form of RFC 3339.
+/// Parses an instant in the form of RFC 3339.
 fn instant(text: &str) -> Option<SystemTime> {
     OffsetDateTime::parse(text, &Rfc3339).ok().map(SystemTime::from)
 }

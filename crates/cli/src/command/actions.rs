@@ -1,4 +1,5 @@
-//! `ratn actions [PROVIDER[/ACTION]]`: what tasks can use, with ports, types, defaults and outcomes, and where each action comes from.
+//! `ratn actions [PROVIDER[/ACTION]]`: the actions that tasks can use, with ports, types, defaults and outcomes, and the origin of
+//! each.
 
 use super::blocking_here;
 use crate::columns::columns;
@@ -34,20 +35,20 @@ pub(crate) struct ActionsArguments {
     json: bool,
 }
 
-/// An action as it is shown.
+/// An action in the list.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 struct Listed {
-    /// `provider/action`
+    /// `provider/action`.
     action: String,
     /// The kind of resource that a state blocks for it.
     resource: String,
-    /// `built in`, a file, or a worker.
+    /// Origin: `built in`, a file, or a worker.
     from: String,
     #[serde(flatten)]
     signature: ActionSignature,
 }
 
-/// Lists them.
+/// Lists the actions.
 pub(crate) fn run(arguments: &ActionsArguments, tls: &ClientTls) -> Result<(), Failure> {
     let mut all = listed(arguments, tls)?;
     if let Some(which) = arguments.which.as_deref() {
@@ -123,7 +124,7 @@ fn listed(arguments: &ActionsArguments, tls: &ClientTls) -> Result<Vec<Listed>, 
 }
 
 impl Listed {
-    /// `{ start: joints, speed?: float = 1 }`
+    /// The inputs: `{ start: joints, speed?: float = 1 }`.
     fn inputs(&self) -> String {
         let ActionSignature { inputs, optional, defaults, .. } = &self.signature;
         let required = inputs.iter().map(|(name, of_type)| format!("{name}: {of_type}"));
@@ -134,7 +135,7 @@ impl Listed {
         required.chain(optional).collect::<Vec<_>>().join(", ")
     }
 
-    /// All that is known of it.
+    /// Everything that is known about the action.
     fn whole(&self) -> String {
         let ActionSignature { outputs, outcomes, description, annotations, .. } = &self.signature;
         let mut lines = vec![format!("{} ({}; a state that uses it blocks {})", self.action, self.from, self.resource)];

@@ -1,9 +1,10 @@
-//! `ratn certs DIR HOST…`: the authority of a system and a certificate for each of its hosts, for TLS of both sides.
+//! `ratn certs DIR HOST…`: the certificate authority of a system and a certificate for each of its hosts, for mutual TLS.
 //!
 //! ```text
 //!   DIR/ca.pem, ca.key (made once) ──signs──▶ DIR/HOST.pem, HOST.key
 //! ```
-//! A host needs `ca.pem` and its own two files; `ca.key` stays where it was made. What is there is kept, unless it is to be renewed.
+//! A host needs `ca.pem` and its own two files; `ca.key` stays where it was made. Existing files are kept, unless a renewal is
+//! requested.
 //! X.509 version 3 with ECDSA on P-256 (RFC 5280), by rcgen.
 
 use crate::arguments::CertsArguments;
@@ -27,32 +28,32 @@ use time::{Date, Duration, OffsetDateTime};
 
 /// The authority's name in the certificates.
 const AUTHORITY: &str = "ratn authority";
-/// How long the authority holds, in days: ten years.
+/// Validity of the authority's certificate, in days: ten years.
 const AUTHORITY_DAYS: i64 = 3650;
-/// Hosts whose clocks are behind take a new certificate all the same.
+/// Certificates are backdated, so that hosts whose clocks are behind accept a new one.
 const BACKDATED: Duration = Duration::DAY;
-/// The longest name of a host (RFC 1035).
+/// Maximum length of a host name (RFC 1035).
 const MAX_NAME: usize = 253;
 
-/// A host, and what else it is reached by.
+/// A host and its additional names and addresses.
 #[derive(Debug, PartialEq)]
 struct Host {
     name: String,
     also: Vec<String>,
 }
 
-/// What became of a host's certificate.
+/// The result for a host.
 #[derive(Debug, Serialize)]
 struct HostCertificate {
     host: String,
     names: Vec<String>,
     cert: String,
     key: String,
-    /// `None`: it was there and is kept.
+    /// Expiry date; `None` where the existing certificate was kept.
     until: Option<String>,
 }
 
-/// Makes what is not there.
+/// Makes the files that do not exist yet.
 pub(super) fn run(arguments: &CertsArguments) -> Result<(), Failure> {
     let hosts = arguments.hosts.iter().map(|text| host(text)).collect::<Result<Vec<_>, _>>();
     let hosts = hosts.map_err(|why| Failure::Refused(format!("ratn: {why}")))?;
@@ -77,7 +78,7 @@ pub(super) fn run(arguments: &CertsArguments) -> Result<(), Failure> {
     Ok(())
 }
 
-/// `HOST` or `HOST=NAME,ADDRESS`
+/// Parses `HOST` or `HOST=NAME,ADDRESS`.
 fn host(text: &str) -> Result<Host, String> {
     let (name, also) = text.split_once('=').unwrap_or((text, ""));
     let also: Vec<String> = also.split(',').filter(|part| !part.is_empty()).map(str::to_owned).collect();
@@ -115,7 +116,7 @@ fn named(name: &str) -> DistinguishedName {
     distinguished
 }
 
-/// The authority that is there, or a new one where there is none.
+/// The existing authority, or a new one where there is none.
 fn authority(directory: &Path, now: OffsetDateTime) -> anyhow::Result<Issuer<'static, KeyPair>> {
     let (cert, key) = (directory.join("ca.pem"), directory.join("ca.key"));
     let params = authority_params(now);
@@ -197,7 +198,7 @@ fn certify(
     Ok(made(Some(day(until.date()))))
 }
 
-/// Whole or as it was.
+/// Writes a file atomically.
 fn write(file: &Path, text: &str, mode: u32) -> anyhow::Result<()> {
     let next = file.with_extension("new");
     let written = fs::OpenOptions::new().write(true).create_new(true).mode(mode).open(&next).and_then(|mut open| {
@@ -243,7 +244,7 @@ mod tests {
         })
     }
 
-    /// Whether a certificate is signed by the authority beside it, for both ends, and names the host.
+    /// Whether a certificate is signed by the authority in the same directory, for client and server, and names the host.
     fn holds(directory: &Path, host: &str, name: &str) -> bool {
         let authority = CertificateDer::from_pem_file(directory.join("ca.pem")).unwrap();
         let der = CertificateDer::from_pem_file(directory.join(format!("{host}.pem"))).unwrap();

@@ -1,4 +1,4 @@
-//! `ratn check TASK`, and what `ratn run` does first.
+//! `ratn check TASK`, and the checks that `ratn run` makes first.
 
 mod annotations;
 
@@ -24,24 +24,24 @@ use ratn_worker::tls::ClientTls;
 use serde::Serialize;
 use std::path::Path;
 
-/// Of a longer chain the last states are shown; `--json` has all.
+/// Maximum number of states shown at the end of a chain; `--json` has all.
 const MAX_LINKS: usize = 40;
 
-/// What `--json` prints.
+/// The output of `--json`.
 #[derive(Debug, Serialize)]
 struct Checked<'a> {
-    /// The task's name; of a task that is refused, none.
+    /// The task's name; `None` for a task that is refused.
     task: Option<&'a str>,
     findings: &'a [Diagnostic],
-    /// Where workers of the running system and its catalogue say something else, and what nobody offers.
+    /// Differences between the workers of the running system and its catalogue, and resources that nobody offers.
     workers: &'a [String],
-    /// What keeps it sequential, unless it was left out or cannot be said.
+    /// What keeps the task sequential, unless that was left out or is unknown.
     sequential: Option<&'a Sequential>,
-    /// Why it cannot be said.
+    /// Why that is unknown.
     obstacle: Option<&'a str>,
 }
 
-/// Says what is wrong with a task file, and what keeps the task sequential.
+/// Reports what is wrong with a task file, and what keeps the task sequential.
 pub(crate) fn run(arguments: &CheckArguments, tls: &ClientTls) -> Result<(), Failure> {
     let (config, system) = against(arguments, tls)?;
     let file = arguments.task.display().to_string();
@@ -91,14 +91,14 @@ pub(crate) fn run(arguments: &CheckArguments, tls: &ClientTls) -> Result<(), Fai
     }
 }
 
-/// The config with the catalogue that a task is checked against, and the running system, where one is named, or meant.
+/// The config with the catalogue that a task is checked against, and the running system, where one is named or implied.
 fn against(arguments: &CheckArguments, tls: &ClientTls) -> Result<(SystemConfig, Option<System>), Failure> {
     let robot = arguments.robot.as_deref();
     let given = arguments.config.as_deref().map(|file| SystemConfig::load_for(Some(file), robot)).transpose()?;
     let tls = &given.as_ref().map_or_else(|| Ok(tls.clone()), |config| config.client_tls(tls))?;
     let mut system = None;
     let named = arguments.runtime_dir.is_some();
-    // A system that only the environment names is meant where nothing else is said, and it runs.
+    // A system that only the environment names is used if nothing else is specified and the system runs.
     let usual = given.is_none() && robot.is_none() && std::env::var_os(DIRECTORY_VARIABLE).is_some();
     if named || usual {
         let directory = public_directory(arguments.runtime_dir.as_deref())?;
@@ -121,7 +121,7 @@ fn against(arguments: &CheckArguments, tls: &ClientTls) -> Result<(SystemConfig,
     Ok((config, system))
 }
 
-/// The states that select an arm, or its gripper, by a name that none of the robot's arms has: the run would wait there.
+/// The states that select an arm, or its gripper, by a name that no arm of the robot has: a run would wait there for ever.
 fn arms_not_there(program: &Program, config: &SystemConfig) -> Vec<String> {
     let mut told = Vec::new();
     for state in &program.states {
@@ -154,7 +154,7 @@ fn arms_not_there(program: &Program, config: &SystemConfig) -> Vec<String> {
     told
 }
 
-/// What keeps the task sequential, or why that cannot be said.
+/// What keeps the task sequential, or why that is unknown.
 fn simulate(
     program: &Program,
     config: &SystemConfig,
@@ -173,7 +173,7 @@ fn simulate(
         parameters,
         elements: usize::from(arguments.elements),
         durations_s: learned.durations_s,
-        // What a system starts when there is demand is there in time.
+        // Workers that a system starts on demand are assumed to be ready in time.
         units: config.promised_resources().into_iter().map(|(kind, units)| (kind, units.max(Quantity::ONE))).collect(),
         attributes: config.module_attributes().clone(),
     };
@@ -219,7 +219,7 @@ fn report(sequential: &Sequential) -> String {
     lines.join("\n")
 }
 
-/// A table of what could be said, under a head.
+/// A table of missing annotations, under a heading.
 fn gains(gains: &[Gain]) -> Vec<String> {
     let row = |gain: &Gain| {
         let Gain { path, missing, alone_s, alone_percent, last_s } = gain;
@@ -237,13 +237,13 @@ pub(super) fn refused(findings: &[Diagnostic]) -> Failure {
     Failure::Refused(lines.join("\n"))
 }
 
-/// The program of a task file, which begins at another state than its first where one is said; warnings go to standard error.
+/// The program of a task file, beginning at the state `from` where one is given; warnings go to standard error.
 pub(crate) fn load(path: &Path, from: Option<&str>, catalogue: &Catalogue) -> Result<Program, Failure> {
     let (text, file) = (read(path)?, path.display().to_string());
     accepted(ratn_model::load::load_beginning(&text, &file, catalogue, &input::Libraries, from))
 }
 
-/// As [`load`], with the findings where it is refused.
+/// As [`load`], returning the findings where the task is refused.
 pub(super) fn found(
     path: &Path,
     from: Option<&str>,
@@ -253,7 +253,7 @@ pub(super) fn found(
     Ok(ratn_model::load::load_beginning(&text, &file, catalogue, &input::Libraries, from).map(told))
 }
 
-/// The program of a task file's text, with libraries from elsewhere; `file` is its name in messages.
+/// The program from a task file's text, with libraries from `libraries`; `file` is its name in messages.
 pub(super) fn load_from(
     libraries: &impl Files,
     text: &str,
@@ -270,7 +270,7 @@ fn accepted(loaded: Result<Loaded, Vec<Diagnostic>>) -> Result<Program, Failure>
     }
 }
 
-/// Warnings go to standard error.
+/// Prints warnings to standard error.
 fn told(loaded: Loaded) -> Program {
     loaded.warnings.iter().for_each(output::progress);
     loaded.program

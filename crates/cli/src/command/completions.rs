@@ -1,4 +1,5 @@
-//! `ratn completions SHELL` and `ratn man DIR`: what the command line says of itself.
+//! `ratn completions SHELL` and `ratn man DIR`: shell completions and man pages of the command
+//! line.
 
 use crate::arguments::{Arguments, CompletionsArguments, ManArguments};
 use crate::failure::Failure;
@@ -8,14 +9,14 @@ use clap::CommandFactory;
 
 const NAME: &str = "ratn";
 
-/// Prints a script for a shell.
+/// Prints the completion script of a shell.
 pub(crate) fn run(arguments: &CompletionsArguments) -> Result<(), Failure> {
     let mut script = Vec::new();
     clap_complete::generate(arguments.shell, &mut Arguments::command(), NAME, &mut script);
     Ok(output::result(String::from_utf8_lossy(&script).trim_end())?)
 }
 
-/// Writes `ratn.1`, and a page for each command, `ratn-run.1`.
+/// Writes `ratn.1`, and a page for each command, such as `ratn-run.1`.
 pub(crate) fn man(arguments: &ManArguments) -> Result<(), Failure> {
     let directory = &arguments.directory;
     let cannot = || format!("cannot write man pages to {}", directory.display());

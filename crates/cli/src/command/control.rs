@@ -1,4 +1,4 @@
-//! `ratn control pause|resume|step|abort|break|clear`
+//! `ratn control pause|resume|step|abort|break|clear`.
 
 use super::{blocking_on, signal};
 use crate::arguments::{ControlArguments, WordArgument};
@@ -8,7 +8,7 @@ use crate::system::public_directory;
 use anyhow::Context;
 use ratn_task_control::control::{self, Message, RunStatus, Word};
 
-/// Tells a run of a system.
+/// Sends a control word to a run of a system.
 pub(crate) fn run(arguments: &ControlArguments) -> Result<(), Failure> {
     let state = arguments.state.clone();
     let breakpoint = |set| Message::Breakpoint { run: arguments.run.clone(), state: state.clone(), set };
@@ -25,7 +25,7 @@ pub(crate) fn run(arguments: &ControlArguments) -> Result<(), Failure> {
     }
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let directory = public_directory(arguments.runtime_dir.as_deref())?;
-        // Before and after: a run that is told to end may be gone when it is asked.
+        // Asked before and after: an aborted run may be gone afterwards.
         let run = &arguments.run;
         let before = control::status(&directory, run).await.ok().flatten();
         let told = control::tell(&directory, run, word).await;
@@ -43,7 +43,7 @@ pub(crate) fn run(arguments: &ControlArguments) -> Result<(), Failure> {
     })
 }
 
-/// What the run does now.
+/// A sentence about what the run does now.
 fn said(word: Word, run: Option<&RunStatus>) -> String {
     let task = run.map_or("the run", |run| run.task.as_str());
     let what = match word {

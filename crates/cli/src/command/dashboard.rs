@@ -1,4 +1,4 @@
-//! `ratn dashboard [LOG…]`: runs and a system as pages in a browser.
+//! `ratn dashboard [LOG…]`: web pages about runs and a system.
 
 use super::blocking;
 use crate::arguments::DashboardArguments;
@@ -22,12 +22,12 @@ use ratn_worker::tls::ClientTls;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// How many elements a list has that an action answers, as `ratn check` assumes.
+/// Assumed number of elements in a list that an action returns, as in `ratn check`.
 const ASSUMED_ELEMENTS: usize = 3;
-/// What a change gains is simulated up to so many events, which bounds the memory that it takes; how long it may take, the dashboard says.
+/// Maximum number of events when the gain of a change is simulated, which bounds the memory; the dashboard sets the time limit.
 const MAX_EVENTS: usize = 50_000;
 
-/// Serves the pages until the user has seen enough.
+/// Serves the pages until the user ends it.
 pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(), Failure> {
     let directory = public_directory(arguments.runtime_dir.as_deref())?;
     let known = KnownSystem::of(directory.clone(), tls.clone());
@@ -59,7 +59,7 @@ pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(),
     })
 }
 
-/// The pages of a system that is up, to look at only; the address is said.
+/// The read-only pages of a running system; prints their address.
 pub(super) async fn of_system(directory: &Path, tls: &ClientTls) -> anyhow::Result<Dashboard> {
     let known = KnownSystem::of(directory.to_owned(), tls.clone());
     let (tasks, robots) = (tasks(known), robots(directory.to_owned(), None));
@@ -69,7 +69,7 @@ pub(super) async fn of_system(directory: &Path, tls: &ClientTls) -> anyhow::Resu
     Ok(dashboard)
 }
 
-/// The task file whose annotations pages may change, checked as `ratn check` does.
+/// The task file whose annotations the pages may change, checked as `ratn check` does.
 fn editing(file: &Path, known: &KnownSystem) -> Result<Editing, Failure> {
     let refused = |error| Failure::Refused(format!("{}: cannot be read: {error}", file.display()));
     input::read(file).map_err(refused)?;
@@ -93,7 +93,7 @@ fn editing(file: &Path, known: &KnownSystem) -> Result<Editing, Failure> {
     Ok(Editing::of(file.to_owned(), kinds, check, makespan))
 }
 
-/// There is nothing to check a file against.
+/// The finding that there is no config to check a file against.
 fn no_config(file: &str, problem: String) -> Diagnostic {
     Diagnostic {
         rule: "no-config".to_owned(),
@@ -116,8 +116,8 @@ fn assumptions(config: &SystemConfig, parameters: BTreeMap<String, Value>) -> As
     }
 }
 
-/// The robot that the user names, else the one that the log names. Of a log that names none, that of the system that runs, or ran, in a directory,
-/// else the one that is built in. What the log moves is held against the robot.
+/// The robot that the user names, else the one that the log names. For a log without a robot: the robot of the system that runs, or ran, in a
+/// directory, else the built-in one. It has to have everything that the log moves.
 fn robots(directory: PathBuf, named: Option<String>) -> Robots {
     Robots::by(move |of_log| {
         let own = || SystemConfig::read(&directory.join(CONFIG_FILE)).ok().map(|config| config.robot);
@@ -137,12 +137,12 @@ fn robots(directory: PathBuf, named: Option<String>) -> Robots {
     })
 }
 
-/// A built-in robot, or one that a file describes.
+/// A built-in robot, or one described by a file.
 fn robot(named: &str, whence: String) -> Result<Known, String> {
     known(named, whence, |error| error.to_string())
 }
 
-/// The robot that a log names. It may name any file: what stands in one that describes no robot is not shown.
+/// The robot that a log names. A log may name any file, so the content of a file that describes no robot is not shown.
 fn robot_of_log(named: &str) -> Result<Known, String> {
     known(named, "as the log says".to_owned(), |error| match error {
         DescriptionError::Form { file, .. } => format!("{} describes no robot", file.display()),
@@ -156,7 +156,7 @@ fn known(named: &str, whence: String, why: impl Fn(DescriptionError) -> String) 
     Ok(Known { robot, looks: Looks::named_or_file(named), whence })
 }
 
-/// Task files are read again whenever somebody asks: they are small, and may have been put back.
+/// Task files are read again for each request: they are small, and may have been restored.
 fn tasks(known: KnownSystem) -> Tasks {
     Tasks::by(move |file| {
         if file.as_os_str().is_empty() {
@@ -172,7 +172,7 @@ fn tasks(known: KnownSystem) -> Tasks {
     })
 }
 
-/// What was asked for cannot be, or what it needs is not there.
+/// Maps an error to a refusal or a failure.
 fn refused(error: DashboardError) -> Failure {
     match error {
         DashboardError::Exposed { .. } | DashboardError::TooMany { .. } => Failure::Refused(format!("ratn: {error}")),
@@ -191,7 +191,7 @@ mod tests {
         let named = file.path().display().to_string();
         let refused = robot_of_log(&named).err().unwrap_or_default();
         assert!(refused.ends_with("describes no robot") && !refused.contains("secret"), "{refused}");
-        // Who names it is told what is wrong with it.
+        // A user who names the file is told what is wrong with it.
         assert!(robot(&named, String::new()).err().unwrap_or_default().contains("secret"));
         Ok(())
     }

@@ -1,6 +1,6 @@
-//! `ratn demo`: the main job. The same task on real processes in several ways, each time in the same cell.
+//! `ratn demo`: the main demonstration. The same task on real processes in several ways, each time in the same cell.
 //!
-//! Every run gets a system of its own, started fresh from the same seed, so that nothing of one run helps or hinders the next.
+//! Every run gets a fresh system, started from the same seed, so that no run affects another.
 
 mod pair;
 mod result;
@@ -31,35 +31,36 @@ use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// The tasks are built in, so that the demo works from anywhere: their files' names and texts.
+/// The tasks are built in, so that the demo works from any folder: file names and texts.
 const FETCH: (&str, &str) = ("fetch_boxes.yaml", include_str!("../../../../examples/fetch_boxes.yaml"));
-/// The same for a robot without base and head, behind a table.
+/// The same task for a robot without base and head, behind a table.
 const FETCH_ON_TABLE: (&str, &str) =
     ("fetch_boxes_table.yaml", include_str!("../../../../examples/fetch_boxes_table.yaml"));
-/// The one for a cell in which something goes wrong, and what it uses: the first one with a look beside each approach.
+/// The recovering task for a cell with faults, and the library that it uses: the first task with an additional look beside each approach.
 const FETCH_WATCHED: (&str, &str) =
     ("fetch_boxes_watched.yaml", include_str!("../../../../examples/fetch_boxes_watched.yaml"));
 const RECOVERING: (&str, &str) =
     ("fetch_boxes_recovering.yaml", include_str!("../../../../examples/fetch_boxes_recovering.yaml"));
-/// The second experiment: what is used by the task that looks first, with a look beside each approach.
+/// The second experiment: a library with a look beside each approach, and the task that looks first and uses it.
 const SET_WATCHED: (&str, &str) =
     ("set_table_watched.yaml", include_str!("../../../../examples/set_table_watched.yaml"));
 const LOOK_AND_SET: (&str, &str) =
     ("set_table_recovering.yaml", include_str!("../../../../examples/set_table_recovering.yaml"));
 
-/// The same two jobs with what can go on beside each other said so.
+/// Both tasks, annotated with what may overlap.
 const FETCH_OVERLAPPED: (&str, &str) =
     ("fetch_boxes_overlapped.yaml", include_str!("../../../../examples/fetch_boxes_overlapped.yaml"));
 const SET_OVERLAPPED: (&str, &str) =
     ("set_table_overlapped.yaml", include_str!("../../../../examples/set_table_overlapped.yaml"));
 
-/// The times for which plans of their state machines may get better, in seconds: the best is compared with the network. 0 leaves it to the planner.
+/// Times in seconds for which plans of the sequential runs may be improved; the network is compared with the best of these runs. 0 leaves the time
+/// to the planner.
 const SWEEP_S: [f64; 3] = [0.0, 0.2, 0.5];
 
-/// How far a bowl or a cup may have leaned on its way, in radians: as far as the task says, and what the grasp adds.
+/// Maximum tilt of a carried bowl or cup, in radians: the task's tolerance plus what the grasp adds.
 const MAX_TILT_RAD: f64 = 0.11;
 
-/// The posture that the task begins to look in, and its parameter for it.
+/// The posture from which the task looks first, and the name of its parameter.
 const OBSERVATION: &str = "observation";
 
 struct BuiltIn;
@@ -98,14 +99,14 @@ pub(crate) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Fail
     let programs = (program, overlapped);
     let setup = Setup { goods: &goods, arguments, config: &config, programs, directory: &directory, tls };
     let mut demonstration = Demonstration::new(arguments, goods);
-    // What went wrong first; the other ways are shown all the same.
+    // The first failure; the other ways are run all the same.
     let mut failed: Option<String> = None;
     let outcome: Result<(), Failure> = blocking_here(async {
         let interrupt = Interrupt::listen()?;
         for plan in plans {
             output::progress(format_args!("\n{}", plan.announcement(&goods)));
             let run = setup.run(&plan, &interrupt);
-            // A config is large.
+            // Boxed, because a config is large.
             let outcome = Box::pin(run).await;
             let outcome = outcome.with_context(|| plan.name())?;
             let wrong = what_is_wrong(&outcome, &goods);
@@ -123,7 +124,7 @@ pub(crate) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Fail
         }
         Ok(())
     });
-    // Whatever was run is shown, also when not all was.
+    // Whatever was run is shown, even if not everything was.
     draw(&mut demonstration)?;
     if arguments.json {
         output::progress(format_args!("\n{demonstration}"));
@@ -136,7 +137,7 @@ pub(crate) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Fail
     failed.map_or(Ok(()), |failed| Err(anyhow!(failed).into()))
 }
 
-/// The task of the last row. It is made for the paper's robot and a cell in which nothing goes wrong, and plates are not looked for.
+/// The task of the last row. It is written for the paper's robot and a cell without faults, and does not look for plates.
 fn overlapped(arguments: &DemoArguments, config: &SystemConfig) -> Option<(&'static str, &'static str)> {
     let fits = config.robot == AIMM && arguments.faults.fault.is_empty() && arguments.budget != Budget::Task;
     match arguments.scenario {
@@ -150,7 +151,7 @@ fn built_in((file, text): (&'static str, &'static str)) -> (&'static str, Cow<'s
     (file, text.into())
 }
 
-/// The text of the task for a robot that is not the paper's, with the table and the places of its workplace.
+/// The text of the task for another robot than the paper's, with the table and the places of its workplace.
 fn on_table(robot: &str, scenario: Setting, arguments: &DemoArguments) -> Result<String, Failure> {
     let refused = |why: String| Failure::Refused(format!("ratn: --robot {robot}: {why}"));
     if scenario != Setting::Boxes {
@@ -164,7 +165,7 @@ fn on_table(robot: &str, scenario: Setting, arguments: &DemoArguments) -> Result
     Ok(table_task::at(FETCH_ON_TABLE.1, workplace)?)
 }
 
-/// A robot's posture out of the camera's view, as a parameter of its task.
+/// A robot's posture outside of the camera's view, as a parameter of its task.
 fn observation(robot: &str) -> anyhow::Result<String> {
     let posture = Robot::named_or_file(robot)?.posture(OBSERVATION);
     let posture = posture.with_context(|| format!("the robot {robot} has no posture `{OBSERVATION}`"))?;
@@ -172,7 +173,7 @@ fn observation(robot: &str) -> anyhow::Result<String> {
     Ok(format!("joints({})", positions.join(", ")))
 }
 
-/// What of a run is not as it should be, if anything, by the cell's ground truth.
+/// What is wrong with the result of a run, if anything, according to the cell's ground truth.
 fn what_is_wrong(outcome: &Outcome, goods: &result::Goods) -> Option<String> {
     let Outcome { delivered, greatest_tilt_rad, end, .. } = outcome;
     if *delivered != goods.count() {
@@ -184,7 +185,7 @@ fn what_is_wrong(outcome: &Outcome, goods: &result::Goods) -> Option<String> {
     })
 }
 
-/// The runs in the order of the table's rows and columns.
+/// The runs, in the order of the table's rows and columns.
 fn plans(arguments: &DemoArguments, overlapped: bool) -> Vec<Plan> {
     let plan = |mode, planners, work| Plan { mode, planners, work };
     let mut plans = Vec::new();
@@ -205,25 +206,25 @@ fn plans(arguments: &DemoArguments, overlapped: bool) -> Vec<Plan> {
         plans.extend(hsm);
         plans.push(plan(Mode::Cdtn, arguments.planners, Work::Overlapped { plan_s: 0.0 }));
     }
-    // With one planner two columns are the same.
+    // With one planner two columns are equal.
     plans.dedup_by_key(|plan| plan.file_stem());
     plans
 }
 
-/// What all runs of a demonstration have in common.
+/// What all runs of a demonstration share.
 struct Setup<'a> {
     goods: &'a result::Goods,
     arguments: &'a DemoArguments,
     config: &'a SystemConfig,
-    /// The paper's task, and the one that overlaps.
+    /// The paper's task, and the overlapped one.
     programs: (Arc<Program>, Option<Arc<Program>>),
-    /// Where logs and charts go.
+    /// The folder of logs and charts.
     directory: &'a Path,
     tls: &'a ClientTls,
 }
 
 impl Setup<'_> {
-    /// Runs the task in one way, on a system of its own.
+    /// Runs the task in one way, on a separate system.
     async fn run(&self, plan: &Plan, interrupt: &Interrupt) -> anyhow::Result<Outcome> {
         let Setup { goods, arguments, config, ref programs, directory, tls } = *self;
         let mut config = config.clone();
@@ -260,7 +261,7 @@ impl Setup<'_> {
         let log_file = directory.join(format!("{}.jsonl", plan.file_stem()));
         let run = Run {
             program: program.clone(),
-            // Its task file is built in.
+            // The task file is built in.
             from: None,
             file: String::new(),
             parameters: program.bind_parameters(&set)?,
@@ -270,7 +271,7 @@ impl Setup<'_> {
             log: log_file.clone(),
             breakpoints: Vec::new(),
             quiet: false,
-            // The system ends with the demo: nobody resumes it.
+            // The system ends with the demo, so nobody resumes the run.
             checkpoint_every: 0,
         };
         let system = starting(Box::pin(System::start_private(config, tls)), interrupt).await?;
@@ -292,7 +293,7 @@ impl Setup<'_> {
     }
 }
 
-/// What touched that should not have, as a sentence.
+/// A sentence about unintended contacts.
 fn said(contacts: &[UnintendedContact]) -> Option<String> {
     let one = |contact: &UnintendedContact| {
         format!(
@@ -317,7 +318,7 @@ fn out_directory(arguments: &DemoArguments) -> anyhow::Result<PathBuf> {
     }
 }
 
-/// One chart per run, all of one row with the time axis of the longest.
+/// Draws a chart per run; all charts of a row have the time axis of the longest run.
 fn draw(demonstration: &mut Demonstration) -> anyhow::Result<()> {
     for outcome in &demonstration.outcomes {
         let same = demonstration.outcomes.iter().filter(|other| other.plan.work.is_like(outcome.plan.work));

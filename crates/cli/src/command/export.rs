@@ -1,4 +1,4 @@
-//! `ratn export FORMAT LOG`
+//! `ratn export FORMAT LOG`.
 
 use crate::arguments::{DrawingArgument, ExportArguments, FormatArgument};
 use crate::failure::Failure;
@@ -10,7 +10,7 @@ use std::fs::File;
 use std::io::{BufWriter, ErrorKind, IsTerminal};
 use std::path::Path;
 
-/// Writes an event log in another form.
+/// Writes an event log in another format.
 pub(crate) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
     let format = format(arguments);
     let mut lines = Lines::of(&arguments.log)?;
@@ -31,7 +31,7 @@ pub(crate) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
             return Err(Failure::Refused(help.to_owned()));
         }
         None => match export(format, lines.by_ref(), BufWriter::new(std::io::stdout().lock())) {
-            // Whoever read it has had enough.
+            // The reader has closed the pipe.
             Err(ExportError::Write(error)) if error.kind() == ErrorKind::BrokenPipe => return Ok(()),
             other => other.map_err(anyhow::Error::from)?,
         },
@@ -82,7 +82,7 @@ mod tests {
         assert!(std::fs::read_to_string(&table)?.contains("\r\n1,look,look,waiting,"));
         assert!(matches!(run(&to(&place.path().join("./run.jsonl"))), Err(Failure::Refused(_))));
         assert_eq!(std::fs::read_to_string(&log)?, LOG);
-        // It does not wait for a reader.
+        // Opening a pipe does not wait for a reader.
         let pipe = place.path().join("pipe");
         nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU)?;
         let refused = run(&to(&pipe)).err().map(|error| error.to_string()).unwrap_or_default();

@@ -1,4 +1,4 @@
-//! Which of several servers leads and which stand by, for people and programs. Of one address there is nothing to say.
+//! Which of several servers leads and which stand by, for people and programs. A single address has nothing to show.
 
 use ratn_worker::client::Health;
 use ratn_worker::endpoint::Endpoint;
@@ -6,18 +6,18 @@ use ratn_worker::tls::ClientTls;
 use serde_json::{Value, json};
 use std::time::Duration;
 
-/// Who has not answered by then does not.
+/// Timeout of an answer.
 const PATIENCE: Duration = Duration::from_millis(500);
 
 /// One of several servers.
 #[derive(Debug)]
 pub(super) struct Member {
     endpoint: Endpoint,
-    /// Whether it leads, else why that is not known.
+    /// Whether it leads, else why that is unknown.
     leads: Result<bool, String>,
 }
 
-/// What each of several servers says; nothing of one alone.
+/// The state of each of several servers; empty for a single one.
 pub(super) async fn ask(endpoint: &Endpoint, tls: &ClientTls) -> Vec<Member> {
     let members = endpoint.members();
     if members.len() < 2 {
@@ -30,7 +30,7 @@ pub(super) async fn ask(endpoint: &Endpoint, tls: &ClientTls) -> Vec<Member> {
     futures::future::join_all(asked).await
 }
 
-/// In one line.
+/// Text in one line.
 pub(super) fn line(role: &str, members: &[Member]) -> String {
     let each = members.iter().map(|Member { endpoint, leads }| match leads {
         Ok(true) => format!("{endpoint} leads"),

@@ -1,4 +1,4 @@
-//! One file per command of the user; `roles.rs` holds the daemons and workers.
+//! One file per command; `roles.rs` has the daemons and workers.
 
 pub(crate) mod actions;
 mod certs;
@@ -37,12 +37,12 @@ use ratn_worker::client::CallError;
 use ratn_worker::tls::ClientTls;
 use std::time::Duration;
 
-/// At the end of a process, for computations under way.
+/// Time for running computations at the end of a process.
 const LAST_WORK: Duration = Duration::from_millis(200);
 
-/// Runs one command to its end.
+/// Runs a command to its end.
 pub(crate) fn run(command: Command) -> Result<(), Failure> {
-    // What every client of this process trusts and shows; a daemon's config may say more.
+    // The TLS settings of every client of this process; a daemon's config may add to them.
     let tls = &ClientTls::from_environment()?;
     match command {
         Command::Demo(arguments) => demo::run(&arguments, tls),
@@ -87,7 +87,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
     }
 }
 
-/// A script can tell a daemon that says no from one that is not there.
+/// Lets a script tell a daemon that refuses from one that does not answer.
 fn unanswered(failure: Failure) -> Failure {
     let Failure::Failed(error) = failure else { return failure };
     if error.downcast_ref::<CallError>().is_some_and(CallError::is_crash) {
@@ -96,12 +96,12 @@ fn unanswered(failure: Failure) -> Failure {
     Failure::Failed(error)
 }
 
-/// Runs a future on this thread: what an event leads to needs no other to be woken.
+/// Runs a future on this thread: handling an event then needs no other thread to be woken.
 fn blocking_here(future: impl Future<Output = Result<(), Failure>>) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), future)
 }
 
-/// Runs a future on a runtime of its own.
+/// Runs a future on a separate runtime.
 fn blocking(future: impl Future<Output = Result<(), Failure>>) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_multi_thread(), future)
 }
@@ -113,7 +113,7 @@ fn blocking_on(
 ) -> Result<(), Failure> {
     let runtime = runtime.enable_all().build().context("cannot start the asynchronous runtime")?;
     let done = runtime.block_on(future);
-    // A computation that does not hear that it is over is not waited for.
+    // Does not wait for computations that do not notice the end.
     runtime.shutdown_timeout(LAST_WORK);
     done
 }

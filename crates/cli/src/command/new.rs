@@ -1,4 +1,4 @@
-//! `ratn new worker NAME` and `ratn new task NAME`: something of one's own to begin with, which builds, runs and is good as it is.
+//! `ratn new worker NAME` and `ratn new task NAME`: a starting point that builds, runs and passes the checks as it is.
 
 use crate::failure::Failure;
 use crate::output;
@@ -7,9 +7,9 @@ use clap::{Args, Subcommand};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Bytes of a name.
+/// Maximum length of a name in bytes.
 const MOST_NAME: usize = 40;
-/// The SDK's source where this program was built; another machine may not have it.
+/// The SDK's source where this program was built; it may not exist on another machine.
 const SDK: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../worker");
 
 #[derive(Debug, Clone, Args)]
@@ -35,7 +35,7 @@ enum New {
     },
 }
 
-/// Makes it.
+/// Makes the worker or the task.
 pub(crate) fn run(arguments: &NewArguments) -> Result<(), Failure> {
     match &arguments.what {
         New::Worker { name, sdk } => worker(name, sdk.as_deref()),
@@ -86,7 +86,7 @@ fn worker(name: &str, sdk: Option<&Path>) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Writes a file that is not there yet.
+/// Writes a file that does not exist yet.
 fn write(file: &Path, text: &str) -> Result<(), Failure> {
     if file.exists() {
         return Err(Failure::Refused(format!(
@@ -97,12 +97,12 @@ fn write(file: &Path, text: &str) -> Result<(), Failure> {
     Ok(fs::write(file, text).with_context(|| format!("cannot write {}", file.display()))?)
 }
 
-/// A name as Rust, tasks and configs write it.
+/// A name in the spellings of Rust, tasks and configs.
 struct Words {
     name: String,
-    /// `box_counter`
+    /// For example `box_counter`.
     provider: String,
-    /// `BoxCounter`
+    /// For example `BoxCounter`.
     kind: String,
 }
 

@@ -1,4 +1,5 @@
-//! `ratn plan`: solves a file of planning problems for any robot and says how fast, how short and how well.
+//! `ratn plan`: solves a file of planning problems for any robot and reports times, path lengths and
+//! success.
 
 use crate::arguments::PlanArguments;
 use crate::failure::Failure;
@@ -16,24 +17,24 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// More pairs of a kind are not named.
+/// Maximum number of pairs named per kind.
 const MOST_NAMED: usize = 8;
 
-/// How often it is said how far the problems are, where they take long.
+/// Interval of progress messages.
 const TOLD_EVERY: Duration = Duration::from_secs(5);
 
-/// Longest file of problems, and of a robot.
+/// Maximum size of a file of problems, and of a robot.
 const MAX_FILE: usize = 256 << 20;
 
-/// A class of problems in numbers.
+/// Results of a class of problems.
 #[derive(Debug, Serialize)]
 struct Class {
     class: String,
     problems: usize,
     solved: usize,
-    /// Those whose start or goal touches something.
+    /// Number of problems whose start or goal touches something.
     invalid: usize,
-    /// Paths that the exact shapes reject.
+    /// Number of paths that the exact shapes reject.
     rejected: usize,
     plan_us: Spread,
     simplify_us: Spread,
@@ -48,7 +49,7 @@ struct Spread {
     p95: Option<f64>,
 }
 
-/// One problem.
+/// Result of one problem.
 #[derive(Debug, Serialize)]
 struct Line {
     index: u64,
@@ -59,7 +60,7 @@ struct Line {
     length_rad: Option<f64>,
     /// Why there is no path, or what the exact check found on it.
     trouble: Option<String>,
-    /// Positions that were beyond a limit by rounding and were taken as the limit.
+    /// Positions that exceeded a limit by rounding and were clamped.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     clamped: Vec<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -96,7 +97,7 @@ pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
     for (class, list) in &problems.classes {
         let mut trials = Vec::new();
         for problem in list {
-            // Most files have one state.
+            // Most files have only one state.
             let mechanism = match robot.take() {
                 Some((state, mechanism)) if state == problem.state => mechanism,
                 _ => {
@@ -123,7 +124,7 @@ pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
     verdict(&classes)
 }
 
-/// What is not checked of the pairs of links, or not in the search, though no SRDF says so.
+/// Pairs of links that are not checked, or not during the search, although no SRDF says so.
 fn pairs_said(model: &RobotModel, has_srdf: bool) -> Option<String> {
     let checks = model.checks();
     let named = |pairs: &mut dyn Iterator<Item = &Pair>| pairs::named(model, pairs, MOST_NAMED);
@@ -173,7 +174,7 @@ fn pairs_said(model: &RobotModel, has_srdf: bool) -> Option<String> {
     Some(lines.join("\n"))
 }
 
-/// The robot with the joints that are not planned for where a problem says.
+/// The robot with its unplanned joints at the positions of a problem.
 fn in_state(
     model: &RobotModel,
     joints: &[String],
@@ -186,7 +187,7 @@ fn in_state(
     model.planned(joints, &state).map_err(|error| refused(&arguments.robot, error))
 }
 
-/// A failure where a path is rejected, or where there is none at all.
+/// A failure where a path is rejected, or where no problem was solved.
 fn verdict(classes: &[Class]) -> Result<(), Failure> {
     let rejected: usize = classes.iter().map(|c| c.rejected).sum();
     if rejected > 0 {
@@ -243,7 +244,7 @@ fn line(index: u64, trial: &Trial, with_paths: bool) -> Line {
     }
 }
 
-/// Nearest ranks.
+/// Percentiles by nearest rank.
 fn spread(mut values: Vec<f64>) -> Spread {
     values.sort_by(f64::total_cmp);
     let rank = |share: f64| {

@@ -1,4 +1,5 @@
-//! SIGHUP to a daemon: its config is read again. What can be taken over is; what cannot is named; a bad config changes nothing.
+//! SIGHUP to a daemon: its config is read again. Settings that can be changed are changed; all others are named; a bad config
+//! changes nothing.
 
 use crate::system::config::SystemConfig;
 use anyhow::Context;
@@ -10,29 +11,29 @@ use ratn_worker::tls::{self, ClientTls, LiveServerTls};
 use std::path::PathBuf;
 use tokio::sync::watch;
 
-/// What surrounds every daemon.
+/// Sections that all daemons share.
 const SHARED: [&str; 2] = ["service", "speed"];
 
-/// A daemon's config and what of it may change.
+/// A daemon's config and the parts that may change.
 pub(super) struct Reloading {
-    /// Without one only the audit log is opened again, and certificates are read again.
+    /// `None`: only the audit log is reopened, and certificates are read again.
     pub(super) file: Option<PathBuf>,
-    /// As the process began with it.
+    /// The config with which the process began.
     pub(super) running: SystemConfig,
-    /// The daemon's section.
+    /// The name of the daemon's section.
     pub(super) role: &'static str,
     pub(super) logs: Logs,
-    /// What is served with TLS shows this.
+    /// The TLS settings of the server.
     pub(super) tls: Option<LiveServerTls>,
-    /// Every client of the daemon trusts and shows this.
+    /// The TLS settings of every client in the daemon.
     pub(super) client_tls: ClientTls,
     pub(super) access: LiveAccess,
-    /// Of the resource manager.
+    /// Limits of the resource manager.
     pub(super) bounds: watch::Sender<ResourceManagerConfig>,
 }
 
 impl Reloading {
-    /// Takes over what can be taken over.
+    /// Reloads the config, as far as possible.
     pub(super) fn reload(&self) {
         match self.try_reload() {
             Ok(rest) if rest.is_empty() => tracing::info!("the config was read again and taken over"),
@@ -43,7 +44,7 @@ impl Reloading {
         }
     }
 
-    /// The keys that need a restart.
+    /// Reloads; returns the keys that need a restart.
     fn try_reload(&self) -> anyhow::Result<Vec<String>> {
         let wanted = match &self.file {
             Some(file) => SystemConfig::read(file)?,

@@ -1,4 +1,4 @@
-//! `ratn report LOG [LOG…]`
+//! `ratn report LOG [LOG…]`.
 
 use crate::arguments::{ReportArguments, RowArgument};
 use crate::failure::Failure;
@@ -11,7 +11,7 @@ use ratn_report::report::{Report, repeated, table};
 use ratn_report::timeline::Timeline;
 use std::path::Path;
 
-/// Says where the time of a run went, or compares several, and draws them.
+/// Reports where the time of a run went, or compares several runs, and draws them.
 pub(crate) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
     if let Some(path) = &arguments.gantt {
         output::check_writable(path)?;

@@ -1,7 +1,7 @@
-//! `ratn reset`: a new table, and a world model that knows nothing of the one before.
+//! `ratn reset`: a new table, and a world model without the old facts.
 //!
-//! The boxes of a new table have the names of the old ones, so facts about those would be taken for facts about these. The reset
-//! counts as a run that goes alone: it is refused while one is under way, and none begins meanwhile.
+//! The boxes of a new table have the same names as the old ones, so old facts would be taken for facts about the new boxes. The
+//! reset counts as a run that needs the system alone: it is refused while a run is in progress, and no run begins meanwhile.
 
 use super::blocking_on;
 use crate::arguments::ResetArguments;
@@ -21,10 +21,10 @@ use ratn_worker::tls::ClientTls;
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-/// A resource manager that opens no session within this time is not there.
+/// Timeout of opening a session at the resource manager.
 const SESSION_DEADLINE: Duration = Duration::from_secs(5);
 
-/// Lays the scene anew and forgets every fact.
+/// Lays out the scene again and deletes every fact.
 pub(crate) fn run(arguments: &ResetArguments, tls: &ClientTls) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref())?);

@@ -1,5 +1,5 @@
-//! `ratn robot check`: reads the description of a robot and says what it has, how far it reaches, what of it collides, and what the
-//! simulated cell misses.
+//! `ratn robot check`: reads the description of a robot and reports its parts, its reach, its collisions, and what the simulated
+//! cell needs in addition.
 
 use crate::arguments::{RobotArguments, RobotCommand};
 use crate::failure::Failure;
@@ -29,7 +29,7 @@ pub(crate) fn run(arguments: &RobotArguments) -> Result<(), Failure> {
     Err(anyhow::anyhow!("{}", listed(robot.name(), &faults)).into())
 }
 
-/// All that is wrong: a line for each where there is more than one.
+/// All faults: one per line where there are several.
 fn listed(robot: &str, faults: &[String]) -> String {
     match faults {
         [fault] => format!("{robot}: {fault}"),
@@ -37,7 +37,7 @@ fn listed(robot: &str, faults: &[String]) -> String {
     }
 }
 
-/// What a cell would refuse in a scene that the robot has a workplace for. Without any workplace the robot is for planning alone.
+/// What a cell would refuse in the scenes for which the robot has a workplace. A robot without a workplace is only for planning.
 fn unmet(robot: &Robot) -> Vec<String> {
     let Some(workplace) = robot.workplace() else { return Vec::new() };
     let table = workplace.tableware.as_ref().map(|_| Setting::Table);
@@ -66,7 +66,7 @@ mod tests {
         assert!(matches!(check(), Err(Failure::Refused(_))));
         std::fs::write(&file, "name = 3").unwrap();
         assert!(matches!(check(), Err(Failure::Failed(_))));
-        // A mesh is a file, too.
+        // A mesh is a separate file.
         let shape = |geometry: &str| {
             format!(
                 "<robot name='r'><link name='foot'><collision><geometry>{geometry}</geometry></collision></link><link name='tool'/>\

@@ -1,4 +1,4 @@
-//! The daemons and workers: this binary as something else.
+//! The daemons and workers: this binary in other roles.
 
 use super::reload::Reloading;
 use super::{blocking, blocking_on};
@@ -34,30 +34,30 @@ use std::time::Duration;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-/// The environment variables that say where state is kept; the second is systemd's.
+/// Environment variables with the folder for state; the second is systemd's.
 const STATE_VARIABLES: [&str; 2] = ["RATN_STATE_DIR", "STATE_DIRECTORY"];
 
-/// After the drain a daemon has this long to end what it owns: workers, a session, what is still to be written.
+/// Time after the drain in which a daemon has to end what it owns: workers, a session, pending writes.
 const EXIT_PATIENCE: Duration = Duration::from_secs(2);
 
-/// `ratn resource-manager`
+/// `ratn resource-manager`.
 pub(super) fn resource_manager(arguments: &KeptRoleArguments, tls: &ClientTls) -> Result<(), Failure> {
     let mut system = SystemConfig::load(arguments.role.config.as_deref())?;
     let config = &mut system.resource_manager;
     arguments.apply(resource_manager::ROLE, &mut config.storage);
     let arguments = &arguments.role;
     config.listen = arguments.listen.clone().unwrap_or(config.listen.clone());
-    // On one thread requests are handled in the order in which they arrive; task control sends the most urgent first.
+    // On one thread requests are handled in the order of arrival; task control sends the most urgent first.
     let runtime = tokio::runtime::Builder::new_current_thread();
     daemon_on(runtime, arguments, system, tls, resource_manager::ROLE, async |_, host| {
         resource_manager::run_as(host.bounds, host.directory, host.serving, host.metrics, host.shutdown).await
     })
 }
 
-/// `ratn world-pool`
+/// `ratn world-pool`.
 pub(super) fn world_pool(arguments: &KeptRoleArguments, tls: &ClientTls) -> Result<(), Failure> {
     let system = SystemConfig::load(arguments.role.config.as_deref())?;
-    // Every call comes to the one actor: what it is handed on the same thread costs no other one to be woken.
+    // Every call goes to the one actor: on the same thread no other thread has to be woken.
     let runtime = tokio::runtime::Builder::new_current_thread();
     daemon_on(runtime, &arguments.role, system, tls, world_pool::ROLE, async |system, host| {
         let mut config = system.world_pool;
@@ -68,20 +68,20 @@ pub(super) fn world_pool(arguments: &KeptRoleArguments, tls: &ClientTls) -> Resu
 }
 
 impl KeptRoleArguments {
-    /// What the command line and the environment say of a role's state.
+    /// Applies the command line and the environment to a role's storage.
     fn apply(&self, role: &str, storage: &mut StorageConfig) {
         storage.durability = self.durability.unwrap_or(storage.durability);
         storage.directory = state_of(role, self.state_dir.as_deref(), storage.directory.take());
     }
 }
 
-/// Where a role keeps its state, as the command line, its config and the environment say, in this order.
+/// Where a role keeps its state: by the command line, else its config, else the environment.
 fn state_of(role: &str, argument: Option<&Path>, configured: Option<PathBuf>) -> Option<PathBuf> {
     let elsewhere = || STATE_VARIABLES.iter().find_map(|name| variable(name)).map(|place| place.join(role));
     argument.map(|place| place.join(role)).or(configured).or_else(elsewhere)
 }
 
-/// `ratn process-manager`
+/// `ratn process-manager`.
 pub(super) fn process_manager(arguments: &RoleArguments, tls: &ClientTls) -> Result<(), Failure> {
     if arguments.check_config {
         startable(&SystemConfig::load(arguments.config.as_deref())?)?;
@@ -96,7 +96,7 @@ pub(super) fn process_manager(arguments: &RoleArguments, tls: &ClientTls) -> Res
     })
 }
 
-/// Refused where a template cannot be started on this machine.
+/// Refuses a config with a template that cannot be started on this machine.
 pub(super) fn startable(config: &SystemConfig) -> Result<(), Failure> {
     let obstacles = config.process_manager.obstacles();
     if obstacles.is_empty() {
@@ -105,7 +105,7 @@ pub(super) fn startable(config: &SystemConfig) -> Result<(), Failure> {
     Err(Failure::Refused(format!("ratn: [process-manager] {}", obstacles.join("; "))))
 }
 
-/// `ratn cell`
+/// `ratn cell`.
 pub(super) fn cell(arguments: &CellArguments, tls: &ClientTls) -> Result<(), Failure> {
     if let Some(file) = &arguments.replay {
         return replay(file);
@@ -132,7 +132,7 @@ pub(super) fn cell(arguments: &CellArguments, tls: &ClientTls) -> Result<(), Fai
     })
 }
 
-/// `ratn cell --replay FILE`
+/// `ratn cell --replay FILE`.
 fn replay(file: &Path) -> Result<(), Failure> {
     let opened = ratn_regular_file::open(file).with_context(|| format!("cannot read {}", file.display()))?;
     let replayed = recording::replay(BufReader::new(opened).lines());
@@ -146,7 +146,7 @@ fn replay(file: &Path) -> Result<(), Failure> {
     Ok(())
 }
 
-/// `ratn worker …`
+/// `ratn worker …`.
 pub(super) fn worker(arguments: &WorkerArguments, tls: &ClientTls) -> Result<(), Failure> {
     telemetry::start();
     let told = ManagerLocation::from_environment();
@@ -187,17 +187,17 @@ pub(super) fn worker(arguments: &WorkerArguments, tls: &ClientTls) -> Result<(),
     blocking(exit_on_panic("the worker", run))
 }
 
-/// What a daemon finds where it runs.
+/// The environment of a daemon.
 struct Host {
-    /// Instead of its config's.
+    /// Overrides the config's address.
     listen: Option<Endpoint>,
     directory: RuntimeDirectory,
     serving: Serving,
-    /// What it trusts and shows as a client.
+    /// The TLS settings of its clients.
     tls: ClientTls,
     metrics: Arc<Metrics>,
     shutdown: CancellationToken,
-    /// The resource manager's section, as it changes.
+    /// The resource manager's section, with its changes.
     bounds: watch::Receiver<ResourceManagerConfig>,
 }
 
@@ -224,7 +224,7 @@ fn daemon_on(
         output::progress("the config is good");
         return Ok(());
     }
-    // As the file has it: what the command line says holds until the end.
+    // The config as in the file: arguments of the command line stay in force until the end.
     let running = SystemConfig::load(arguments.config.as_deref())?;
     let mut service = system.service.clone();
     service.insecure |= arguments.insecure;
@@ -249,7 +249,7 @@ fn daemon_on(
             .with_context(|| format!("cannot make the runtime directory {}", directory.display()))?;
         let resource = vec![("service.name", format!("ratn-{role}"))];
         let spans = ratn_otlp::start(&service.otlp, resource, |said| tracing::warn!("{said}"));
-        // The config was checked.
+        // The config was checked, so this succeeds.
         let spans = spans.ok().flatten();
         let metrics = Arc::new(Metrics::new(role).with_spans());
         if let Some(address) = arguments.metrics.or_else(|| service.metrics.get(role).copied()) {
@@ -265,13 +265,13 @@ fn daemon_on(
         let host = Host { listen, directory, shutdown, bounds: bounds_of, serving, tls: client_tls.clone(), metrics };
         let file = arguments.config.clone();
         let reloading = Reloading { file, running, role, logs, tls, client_tls, access, bounds };
-        // The service manager hears of the process until its state is closed, not only while it serves.
+        // Reports to the service manager until the state is closed, not only while the process serves.
         let phase = host.serving.phase.clone();
         let followed =
             supervisor.follow(host.serving.phase.subscribe(), host.serving.vitals.clone(), move || reloading.reload());
         let followed = tokio::spawn(exit_on_panic("the link to the service manager", followed));
         let vitals = host.serving.vitals.clone();
-        // What is left to do once the core has ended may hang.
+        // The cleanup after the end of the core may hang.
         let overdue = async {
             let failure = vitals.failed().await;
             tokio::time::sleep(EXIT_PATIENCE).await;
@@ -285,7 +285,7 @@ fn daemon_on(
         if let Some(spans) = spans {
             spans.flush(ratn_otlp::END_OF_SERVER).await;
         }
-        // Also where it ended so during the drain.
+        // Also where the core failed during the drain.
         let failure = vitals.condition().borrow().failure.clone();
         if let Some(failure) = failure {
             core_ended(&failure);
@@ -296,13 +296,14 @@ fn daemon_on(
     })
 }
 
-/// The core has ended before its time: so does the process, whatever else of it still runs.
+/// The core has failed: the process ends, whatever else of it still runs.
 fn core_ended(failure: &CoreFailure) -> ! {
     output::progress(format_args!("ratn: {failure}"));
     std::process::exit(failure.exit_code().into())
 }
 
-/// Refused where it could not listen, or another one has its state or its place: it has not begun then. Failed otherwise.
+/// Refused where it could not listen, or another process has its state or its place: then it has not begun. Failed
+/// otherwise.
 fn refused_if_not_started(error: anyhow::Error) -> Failure {
     let not_started = error
         .chain()

@@ -31,7 +31,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::SystemTime;
 
-/// Characters of an output that a terminal shows.
+/// Maximum number of characters of an output on a terminal.
 const MOST_OF_AN_OUTPUT: usize = 300;
 
 impl From<ModeArgument> for Mode {
@@ -43,7 +43,7 @@ impl From<ModeArgument> for Mode {
     }
 }
 
-/// Runs a task once, or goes on with a run.
+/// Runs a task once, or resumes a run.
 pub(crate) fn run(arguments: &RunArguments, tls: &ClientTls) -> Result<(), Failure> {
     if arguments.quiet {
         output::be_quiet();
@@ -170,7 +170,7 @@ impl From<UrgencyArgument> for Urgency {
     }
 }
 
-/// How the run is followed while it goes on, beside the lines of its nodes; on a terminal in place of them.
+/// How the run's progress is shown, in addition to the lines of its nodes, or on a terminal in place of them.
 fn way(arguments: &RunArguments) -> Option<Way> {
     let is_seen = std::io::stderr().is_terminal() && can_paint();
     match arguments.json {
@@ -188,7 +188,7 @@ fn conclude(ended: &Ended, log: &Path, arguments: &RunArguments) -> Result<(), F
     }
 }
 
-/// Starts something, unless the user has enough of it first.
+/// Starts something, unless the user interrupts it.
 pub(super) async fn starting<T>(
     start: impl Future<Output = anyhow::Result<T>>,
     interrupt: &Interrupt,
@@ -199,7 +199,7 @@ pub(super) async fn starting<T>(
     }
 }
 
-/// What a run is beside others on its system.
+/// How a run competes with others on its system.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Beside {
     alone: bool,
@@ -208,7 +208,7 @@ pub(super) struct Beside {
 }
 
 impl Beside {
-    /// Of a run that begins now.
+    /// For a new run.
     fn of(arguments: &RunArguments) -> Result<Beside, Failure> {
         let due = arguments.due.map(|due| due.from(SystemTime::now())).transpose();
         let due = due.map_err(|why| Failure::Refused(format!("ratn: {why}")))?;
@@ -217,7 +217,7 @@ impl Beside {
         Ok(Beside { alone: arguments.alone, urgency: arguments.urgency.into(), standing })
     }
 
-    /// Of a run that is resumed, and had this share: it keeps that unless another one is asked for.
+    /// For a resumed run that had this share: it keeps the share unless another one is requested.
     fn going_on(arguments: &RunArguments, share: Option<f64>) -> Result<Beside, Failure> {
         let mut beside = Beside::of(arguments)?;
         let kept = share.filter(|share| arguments.share.is_none() && Standing::SHARES.contains(share));
@@ -231,8 +231,8 @@ impl Beside {
     }
 }
 
-/// Runs a task, alone on its system or beside others and as urgent as is said. Asks `afterwards` what has become of the system, and ends the
-/// system if it was started for this.
+/// Runs a task, alone on its system or among others with the given urgency. Calls `afterwards` to examine the system, and ends the system if
+/// it was started for this run.
 pub(super) async fn on_system<T>(
     run: Run,
     mut system: System,
@@ -268,7 +268,7 @@ fn say(ended: &Ended, log: &Path, arguments: &RunArguments) -> anyhow::Result<()
         });
         return output::result(json_text(&document, how == JsonArgument::Lines)?);
     }
-    // A person at a terminal does not read a covariance of many numbers, and it would move the rest out of sight.
+    // A long covariance is of no use at a terminal, and would scroll the rest out of sight.
     let most = if std::io::stdout().is_terminal() { MOST_OF_AN_OUTPUT } else { usize::MAX };
     let outputs = ended.outputs.iter().map(|(name, value)| {
         format!("\n{name} = {}", shortened(&value.to_string(), most, "--json prints all, and so does a pipe"))
@@ -276,7 +276,7 @@ fn say(ended: &Ended, log: &Path, arguments: &RunArguments) -> anyhow::Result<()
     output::result(format_args!("{statistics}{}", outputs.collect::<String>()))
 }
 
-/// A value as other programs expect it; what has no plain form is written as in an event log.
+/// A value as other programs expect it; values without a plain form are written as in an event log.
 fn plain(value: &Value) -> serde_json::Value {
     match value {
         Value::Null => serde_json::Value::Null,
@@ -322,7 +322,7 @@ mod tests {
         assert_eq!(share(&["--resume", "log.jsonl"], Some(2.5)), Some(2.5));
         assert_eq!(share(&["--resume", "log.jsonl", "--share", "1"], Some(2.5)), Some(1.0));
         assert_eq!(share(&["--resume", "log.jsonl"], None), Some(1.0));
-        // Whoever has changed the log.
+        // The log may have been edited.
         assert_eq!(share(&["--resume", "log.jsonl"], Some(-3.0)), Some(1.0));
     }
 }

@@ -1,7 +1,7 @@
 //! `ratn stop`, `ratn hold`, `ratn go-on`: emergency stop and hold of every driver of a system.
 //!
-//! The cell of this machine is asked at once, and then the others that the resource manager tells of: without it the cell is stopped all the
-//! same. Exit code 0 only where everybody has confirmed.
+//! The cell of this machine is asked at once, and then the other drivers that the resource manager lists: so the cell is stopped even
+//! without the resource manager. Exit code 0 only where every driver has confirmed.
 
 use super::blocking_on;
 use crate::arguments::{GoOnArguments, HoldArguments, SafetyArguments, StopArguments};
@@ -19,10 +19,10 @@ use ratn_worker::tls::ClientTls;
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-/// Who has not answered by then has not confirmed.
+/// Timeout of a confirmation.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(3);
 
-/// What is asked of every driver.
+/// The request to every driver.
 #[derive(Debug, Clone)]
 enum Question {
     Stop(String),
@@ -32,7 +32,7 @@ enum Question {
     Show,
 }
 
-/// `ratn stop`
+/// `ratn stop`.
 pub(crate) fn stop(arguments: &StopArguments, tls: &ClientTls) -> Result<(), Failure> {
     let question = match (arguments.clear, arguments.show) {
         (true, _) => Question::Clear,
@@ -42,12 +42,12 @@ pub(crate) fn stop(arguments: &StopArguments, tls: &ClientTls) -> Result<(), Fai
     ask_all(&arguments.drivers, tls, &question)
 }
 
-/// `ratn hold`
+/// `ratn hold`.
 pub(crate) fn hold(arguments: &HoldArguments, tls: &ClientTls) -> Result<(), Failure> {
     ask_all(&arguments.drivers, tls, &Question::Hold(reason(&arguments.reason)))
 }
 
-/// `ratn go-on`
+/// `ratn go-on`.
 pub(crate) fn go_on(arguments: &GoOnArguments, tls: &ClientTls) -> Result<(), Failure> {
     ask_all(&arguments.drivers, tls, &Question::GoOn)
 }
@@ -62,7 +62,7 @@ fn ask_all(arguments: &SafetyArguments, tls: &ClientTls, question: &Question) ->
         let channels = Channels::new(tls);
         let known: BTreeSet<Endpoint> =
             arguments.endpoint.iter().cloned().chain(directory.find(ratn_cell::ROLE)).collect();
-        // Whoever is known is asked while the others are looked for.
+        // Known drivers are asked while the others are looked up.
         let (mut answers, offered) =
             tokio::join!(ask(&channels, question, &known), drivers::offered(&channels, &directory, ANSWER_DEADLINE));
         let others = match offered {

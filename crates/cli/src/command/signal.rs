@@ -1,6 +1,7 @@
-//! `ratn signal RUN NAME [VALUE]` and `ratn answer RUN CHOICE`: what states of a run wait for.
+//! `ratn signal RUN NAME [VALUE]` and `ratn answer RUN CHOICE`: signals and answers that states of
+//! a run wait for.
 //!
-//! Exit code 0 when it is in the run's log, on the disk.
+//! Exit code 0 when the message is in the run's log, on the disk.
 
 use super::blocking_on;
 use crate::arguments::{AnswerArguments, SignalArguments};
@@ -31,7 +32,7 @@ pub(crate) fn answer(arguments: &AnswerArguments) -> Result<(), Failure> {
     send(arguments.runtime_dir.as_deref(), &Message::Answer { run, state, choice })
 }
 
-/// Sends a message to the run of a system, and says what becomes of it.
+/// Sends a message to the run of a system, and prints the result.
 pub(crate) fn send(directory: Option<&Path>, message: &Message) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let directory = public_directory(directory)?;

@@ -1,4 +1,4 @@
-//! `ratn simulate`: scheduling problems that nobody here has made, as tasks, in virtual time.
+//! `ratn simulate`: runs published scheduling problems as tasks in virtual time.
 
 use crate::arguments::SimulateArguments;
 use crate::failure::Failure;
@@ -12,33 +12,34 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// What came of a job shop.
+/// The result of a job shop.
 #[derive(Debug, Serialize)]
 struct Comparison {
-    /// The file's name without its ending.
+    /// The file's name without its extension.
     instance: String,
     makespan: f64,
     best_known: Option<f64>,
-    /// Of the makespan to the best known or, where durations vary, to that of a run that knows them.
+    /// Ratio of the makespan to the best known one or, where durations vary, to that of a run that knows the
+    /// durations.
     ratio: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     clairvoyant: Option<f64>,
 }
 
-/// What came of a project.
+/// The result of a project.
 #[derive(Debug, Serialize)]
 struct ProjectComparison {
     #[serde(flatten)]
     comparison: Comparison,
-    /// No schedule is shorter: the longest path, and what each resource has to do.
+    /// A lower bound of the makespan: the longest path, and the total work of each resource.
     lower_bound: f64,
 }
 
-/// What came of all projects.
+/// The results of all projects.
 #[derive(Debug, Serialize)]
 struct Projects {
     projects: Vec<ProjectComparison>,
-    /// Over those that have a ratio.
+    /// Over the projects that have a ratio.
     mean_ratio: Option<f64>,
     worst_ratio: Option<f64>,
 }
@@ -71,7 +72,7 @@ fn projects(arguments: &SimulateArguments) -> Result<(), Failure> {
             .map_err(|problem| Failure::Refused(format!("{}: no table of makespans: {problem}", file.display())))?,
         None => BTreeMap::new(),
     };
-    // All are read before any is run.
+    // All files are read before any is run.
     let mut all = Vec::new();
     for file in &arguments.project {
         let activities = psplib::parse(&read(file)?)
@@ -106,7 +107,7 @@ fn read(file: &Path) -> Result<String, Failure> {
     input::read(file).map_err(|error| Failure::Refused(format!("{}: cannot be read: {error}", file.display())))
 }
 
-/// The file's name without its ending.
+/// The file's name without its extension.
 fn name(file: &Path) -> String {
     file.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
@@ -139,7 +140,7 @@ fn compare(
         Some(_) => Some(execute(activities, Execution { is_clairvoyant: true, ..execution })?),
         None => None,
     };
-    // Best known makespans are of the durations as they are estimated.
+    // Best known makespans are for the estimated durations.
     let reference = if clairvoyant.is_some() { clairvoyant } else { best_known };
     Ok(Comparison {
         instance,

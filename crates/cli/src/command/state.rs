@@ -1,4 +1,5 @@
-//! `ratn state backup|restore|copy|show`: what a daemon keeps, copied while it runs, put back, moved to other storage, looked at.
+//! `ratn state backup|restore|copy|show`: copies a daemon's state while it runs, restores it, moves it to other storage, or shows
+//! it.
 
 use crate::arguments::{StateArguments, StateCommand};
 use crate::failure::Failure;
@@ -12,7 +13,7 @@ use ratn_storage::{
 use serde_json::json;
 use std::path::Path;
 
-/// Copies, puts back, or shows.
+/// Performs the command.
 pub(super) fn run(arguments: &StateArguments) -> Result<(), Failure> {
     match &arguments.command {
         StateCommand::Backup { state, target } => copied(backup(state, target), arguments.json, target),
@@ -24,7 +25,7 @@ pub(super) fn run(arguments: &StateArguments) -> Result<(), Failure> {
 
 fn copied(copied: Result<Copied, CopyError>, as_json: bool, target: &Path) -> Result<(), Failure> {
     let Copied { through, snapshot } = copied.map_err(|error| match error {
-        // What was asked for makes no sense; what is there is as it was.
+        // The request makes no sense; existing files are unchanged.
         CopyError::Nothing { .. } | CopyError::NotEmpty { .. } => Failure::Refused(format!("ratn: {error}")),
         other => Failure::Failed(other.into()),
     })?;

@@ -1,7 +1,7 @@
-//! `ratn status`: what runs, who holds what, and who waits for what and why.
+//! `ratn status`: what runs, what is held by whom, and what waits for what and why.
 //!
-//! What the runs are doing they say themselves, over their sockets in the runtime directory; who holds and who waits is the resource manager's
-//! word, as are the runs of other hosts. Exit code 0 also where no run is under way; 2 where no system is.
+//! The runs report their own state, over their sockets in the runtime directory; holders, waiting requests and runs of other hosts come from
+//! the resource manager. Exit code 0 also where no run is in progress; 2 where no system runs.
 
 use super::{blocking_on, unanswered};
 use crate::arguments::StatusArguments;
@@ -28,38 +28,38 @@ use serde::Serialize;
 use std::path::Path;
 use std::time::Duration;
 
-/// A driver that has not answered by then does not say what is in force.
+/// Timeout of a driver's answer.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// More lines of one kind are counted, not shown.
+/// Further lines of one kind are counted, not shown.
 pub(super) const MOST_LINES: usize = 40;
 
-/// What is shown.
+/// The content of the display.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(super) struct Status {
-    /// The drivers that are held or stopped, or do not say.
+    /// The drivers that are held or stopped, or do not answer.
     drivers: Vec<Driver>,
-    /// What the runs here are doing, in the order of their ids.
+    /// The states of the runs on this host, sorted by id.
     runs: Vec<RunStatus>,
-    /// The ids of runs that are under way elsewhere, or do not say what they are doing.
+    /// The ids of runs on other hosts, and of runs that do not answer.
     elsewhere: Vec<String>,
     held: Vec<Held>,
     waiting: Vec<Waiting>,
-    /// Resources that nobody holds.
+    /// Resources that are not held.
     free: Vec<String>,
 }
 
-/// A driver at which goals are not simply performed.
+/// A driver that does not accept goals normally.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 struct Driver {
     endpoint: String,
     /// `held`, `stopped`, or `unknown`.
     state: &'static str,
-    /// Who wants it and why, or why it is not known.
+    /// Who requested the state and why, or why it is unknown.
     reason: String,
 }
 
-/// A part of a resource that somebody holds.
+/// Units of a resource that are held.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 struct Held {
     resource: String,
@@ -68,15 +68,15 @@ struct Held {
     lease: u64,
 }
 
-/// Somebody who waits.
+/// A waiting request.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 struct Waiting {
     holder: String,
-    /// What is in the way.
+    /// Its obstacles.
     obstacles: Vec<String>,
 }
 
-/// Shows it once, or until the user has seen enough.
+/// Shows it once, or until the user ends it.
 pub(crate) fn run(arguments: &StatusArguments, tls: &ClientTls) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let directory = public_directory(arguments.runtime_dir.as_deref())?;
@@ -116,7 +116,7 @@ impl Status {
             };
             resource.holdings.iter().map(held).collect::<Vec<_>>()
         };
-        // Room for projections is no thing that somebody looks for, and the runs are told of above.
+        // Room for projections is not of interest here, and runs are listed above.
         let is_thing = |kind: &str| kind != WORLD_MODEL && kind != RUN_KIND;
         let things = || resources.iter().filter(|resource| is_thing(&resource.kind));
         let is_free = |resource: &&Resource| resource.holdings.is_empty() && resource.free > Quantity::ZERO;
@@ -147,7 +147,7 @@ impl Status {
         }
     }
 
-    /// For people, with at most so many lines of one kind.
+    /// Text for people, with at most `most` lines of one kind.
     pub(super) fn text(&self, directory: &Path, colours: Colours, most: usize) -> String {
         let mut lines = Vec::new();
         let section = |lines: &mut Vec<String>, head: &str, rows| section(lines, head, rows, most);
@@ -193,7 +193,7 @@ impl Status {
     }
 }
 
-/// What a run is beside others, where it is not as usual or there are several.
+/// A run's share and due time, where they are unusual or there are several runs.
 fn beside(run: &RunStatus, runs: usize) -> Option<String> {
     let due = run.due_in_s.map(|due| match due {
         due if due >= 0.0 => format!(", due in {due:.0} s"),
@@ -202,7 +202,7 @@ fn beside(run: &RunStatus, runs: usize) -> Option<String> {
     (runs > 1 || run.share != 1.0 || due.is_some()).then(|| format!("share {}{}", run.share, due.unwrap_or_default()))
 }
 
-/// A head and a line each; nothing where there are none.
+/// A heading and a line for each row; nothing without rows.
 fn section(lines: &mut Vec<String>, head: &str, mut rows: Vec<[String; 2]>, most: usize) {
     if rows.is_empty() {
         return;

@@ -1,4 +1,4 @@
-//! `ratn tables`: the paper's tables, replayed in virtual time through the same executive as on the robot.
+//! `ratn tables`: the paper's tables, in virtual time with the same executive as on the robot.
 
 use crate::arguments::TablesArguments;
 use crate::failure::Failure;
@@ -63,7 +63,7 @@ fn draw(directory: &Path, scenarios: &[Scenario]) -> anyhow::Result<()> {
         for (mode, planners, name) in [(Mode::Hsm, 1, "hsm"), (Mode::Cdtn, 1, "cdtn-1mp"), (Mode::Cdtn, 2, "cdtn-2mp")]
         {
             let run = scenario.replay(mode, planners)?;
-            // All charts of a row have the time axis of the first, the longest.
+            // All charts of a row have the time axis of the first, which is the longest.
             let scale_s = *scale_s.get_or_insert(run.end_s);
             let objects = scenario.objects.to_lowercase().replace('+', "-");
             let path = directory.join(format!("table-{}-{objects}-{name}.html", scenario.table.to_lowercase()));

@@ -1,4 +1,4 @@
-//! `ratn top`: a whole system at a glance, again and again.
+//! `ratn top`: a whole system at a glance, refreshed repeatedly.
 
 use super::status::{MOST_LINES, Status};
 use super::{blocking_on, pool, unanswered};
@@ -13,10 +13,10 @@ use ratn_worker::client::{Channels, ResourceClient};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::tls::ClientTls;
 
-/// Lines of one kind that are shown also where there is no room for all of them.
+/// Minimum number of lines of one kind, even where not all fit.
 const LEAST_LINES: usize = 2;
 
-/// Shows it until the user has seen enough.
+/// Shows it until the user ends it.
 pub(crate) fn run(arguments: &TopArguments, tls: &ClientTls) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let directory = public_directory(arguments.runtime_dir.as_deref())?;
@@ -29,7 +29,7 @@ pub(crate) fn run(arguments: &TopArguments, tls: &ClientTls) -> Result<(), Failu
             let status = Status::of(&directory, &channels, &client).await.map_err(unanswered)?;
             let workers = pool::overview(Some(directory.clone()), tls).await.map_err(unanswered)?;
             let text = |most| format!("{}\n\n{workers}", status.text(&directory, colours, most));
-            // Where there is little room, fewer lines of a kind leave some for the others.
+            // Where space is short, fewer lines of each kind leave room for the other kinds.
             let most = match repainting::room().filter(|_| !arguments.once) {
                 Some((width, height)) => {
                     (LEAST_LINES..=MOST_LINES).rev().find(|most| fits(&text(*most), width, height))

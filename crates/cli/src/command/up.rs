@@ -13,7 +13,8 @@ use ratn_worker::shutdown;
 use ratn_worker::tls::ClientTls;
 use tokio_util::sync::CancellationToken;
 
-/// Starts it and keeps it running until the user or one of its processes ends it, or the parent is gone that it shall end with.
+/// Starts the system and keeps it running until the user or one of its processes ends it, or until the parent ends with which
+/// it has to end.
 pub(crate) fn run(arguments: &UpArguments, tls: &ClientTls) -> Result<(), Failure> {
     let mut config = SystemConfig::load_for(arguments.config.as_deref(), arguments.system.robot.as_deref())?;
     config.apply(&arguments.system);
@@ -41,7 +42,7 @@ pub(crate) fn run(arguments: &UpArguments, tls: &ClientTls) -> Result<(), Failur
         let shown = async {
             match dashboard {
                 Some(Ok(dashboard)) => dashboard.serve().await,
-                // The system is up without pages, too.
+                // The system runs without the dashboard, too.
                 Some(Err(error)) => output::progress(format_args!("there is no dashboard: {error}")),
                 None => {}
             }

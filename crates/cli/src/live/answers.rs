@@ -1,4 +1,4 @@
-//! What an operator is asked while a run is painted on a terminal, and what he types there.
+//! Questions to the operator while a run is painted on a terminal, and the answers typed there.
 
 use crate::output;
 use nix::errno::Errno;
@@ -14,37 +14,37 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// A run in the background of its shell reads nothing; so often it is looked whether it is in the foreground again.
+/// Interval at which a run in the background of its shell, which cannot read, checks whether it is in the foreground again.
 const IN_BACKGROUND: Duration = Duration::from_secs(1);
 
-/// The questions that are open.
+/// The open questions.
 #[derive(Debug, Default)]
 pub(super) struct Questions {
     open: BTreeMap<InstanceId, (String, Vec<String>)>,
-    /// The run, once its log says it.
+    /// The run's id, once the log has it.
     run: String,
-    /// The system whose run is answered by what is typed, until somebody listens.
+    /// The system whose run the typed answers are for; taken when the listener starts.
     directory: Option<PathBuf>,
     typing: Option<Arc<Typing>>,
     has_changed: bool,
 }
 
-/// What whoever reads the terminal tells whoever paints on it.
+/// Shared state of the reader of the terminal and the painter.
 #[derive(Debug, Default)]
 struct Typing {
-    /// A line was typed, and what was said of it stands where the questions were.
+    /// A line was typed, and its result has replaced the questions on the screen.
     has_come: AtomicBool,
-    /// Nothing more will be read.
+    /// No more lines will be read.
     is_over: AtomicBool,
 }
 
 impl Questions {
-    /// What is typed on this terminal answers the run of the system in `directory`; `None`: nobody types.
+    /// Text typed on this terminal answers the run of the system in `directory`; `None` where nobody can type.
     pub(super) fn new(directory: Option<PathBuf>) -> Questions {
         Questions { directory, ..Questions::default() }
     }
 
-    /// A line of the log.
+    /// Processes a line of the log.
     pub(super) fn follow(&mut self, line: &LogLine) {
         let note = match &line.entry {
             LogEntry::Event(Event::Started { origin, .. }) => return origin.run.clone_into(&mut self.run),
@@ -55,7 +55,7 @@ impl Questions {
             Note::Awaiting { instance, awaited: Awaited::Answer { question, choices, .. }, .. } => {
                 self.open.insert(*instance, (question.clone(), choices.clone()));
                 self.has_changed = true;
-                // Before the first question nothing is read: what is typed then is for the shell.
+                // Before the first question nothing is read: text typed earlier is for the shell.
                 if let Some(directory) = self.directory.take() {
                     self.typing = listen(directory, self.run.clone());
                 }
@@ -67,7 +67,7 @@ impl Questions {
         }
     }
 
-    /// Whether what is painted stays as it is: somebody may be typing.
+    /// Whether the painted lines must stay as they are, because the user may be typing.
     pub(super) fn keep_still(&mut self) -> bool {
         let has_come = self.typing.as_ref().is_some_and(|typing| typing.has_come.swap(false, Ordering::Relaxed));
         let has_changed = std::mem::take(&mut self.has_changed) || has_come;
@@ -92,22 +92,22 @@ impl Questions {
     }
 }
 
-/// Sends what is typed to a run of the system in `directory`, as long as this process lives; `None`: nobody listens.
+/// Sends typed lines to a run of the system in `directory`, as long as this process lives; `None` where that is impossible.
 fn listen(directory: PathBuf, run: String) -> Option<Arc<Typing>> {
     let typing = Arc::new(Typing::default());
     let told = Arc::clone(&typing);
     let listening = move || {
-        // Whoever reads a terminal from the background is stopped by one of these signals, and whoever changes it by the other one, with all
-        // its threads; with them blocked, that fails.
+        // A background process that reads the terminal is stopped by SIGTTIN, and one that changes it by SIGTTOU, with all its threads; with
+        // both signals blocked, the operation fails instead.
         let mut stopping = SigSet::from(Signal::SIGTTIN);
         stopping.add(Signal::SIGTTOU);
         if stopping.thread_block().is_ok()
             && let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_all().build()
         {
-            // What was typed before the question is no answer to it.
+            // Text typed before the question is not an answer to it.
             let _ = tcflush(std::io::stdin(), FlushArg::TCIFLUSH);
             while let Some(line) = typed() {
-                // The line is on the terminal, below what is painted.
+                // The typed line is on the terminal now, below the painted lines.
                 output::area_was_pushed();
                 if let Some(message) = answer(&run, &line) {
                     match runtime.block_on(control::send(&directory, &message)) {
@@ -124,7 +124,7 @@ fn listen(directory: PathBuf, run: String) -> Option<Arc<Typing>> {
     thread.is_ok().then_some(typing)
 }
 
-/// The next line; `None` when there will be no other.
+/// The next line; `None` at the end of input.
 fn typed() -> Option<String> {
     let mut line = String::new();
     loop {
@@ -137,7 +137,7 @@ fn typed() -> Option<String> {
     }
 }
 
-/// `go`, or `STATE go`.
+/// Parses `go`, or `STATE go`.
 fn answer(run: &str, line: &str) -> Option<Message> {
     let mut words = line.split_whitespace();
     let (first, second) = (words.next()?, words.next());

@@ -1,5 +1,4 @@
-//! A catalogue that is made of several: what is built in and what files say. What comes later overrides what came before, action by
-//! action and kind by kind.
+//! A catalogue composed of the built-in one and files. Later ones override earlier ones, action by action and kind by kind.
 
 use crate::input;
 use anyhow::Context;
@@ -8,13 +7,13 @@ use std::collections::BTreeSet;
 use std::collections::btree_map::Entry;
 use std::path::Path;
 
-/// The name of the catalogue that is built in.
+/// The name of the built-in catalogue.
 pub(crate) const BUILT_IN: &str = "built-in";
-/// Files of one catalogue.
+/// Maximum number of files of a catalogue.
 const MOST_FILES: usize = 32;
 
-/// The catalogues of these names, one over the other; and which kinds of resources the built-in one alone speaks of. Files are found from
-/// `folder`.
+/// Composes the catalogues with these names, in order; also returns the kinds of resources that only the built-in one has. Files are
+/// found relative to `folder`.
 pub(crate) fn compose(names: &[String], folder: &Path) -> anyhow::Result<(Catalogue, BTreeSet<String>)> {
     anyhow::ensure!(names.len() <= MOST_FILES, "{} catalogues: at most {MOST_FILES} are read", names.len());
     let (mut composed, mut built_in) = (Catalogue::default(), BTreeSet::new());
@@ -38,7 +37,7 @@ pub(crate) fn read(file: &Path) -> anyhow::Result<Catalogue> {
     Catalogue::from_toml(&text).with_context(|| file.display().to_string())
 }
 
-/// Adds another catalogue; of what both have the added one decides.
+/// Adds another catalogue; where both have an entry, the added one wins.
 pub(crate) fn extend(catalogue: &mut Catalogue, by: Catalogue) {
     for (name, Provider { resource, joints, chain, actions }) in by.providers {
         match catalogue.providers.entry(name) {

@@ -1,4 +1,4 @@
-//! The config of a whole system: one TOML file, of which every role takes its own section.
+//! The config of a whole system: one TOML file with a section for each role.
 
 use super::catalogue;
 use crate::arguments::SystemArguments;
@@ -24,16 +24,16 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-/// What is used without `--config`.
+/// The config that is used without `--config`.
 const DEFAULT: &str = include_str!("../../../../deploy/ratn.toml");
 const DEFAULT_NAME: &str = "the built-in config";
-/// In the arguments of a template: the system's speed.
+/// Placeholder for the system's speed in the arguments of a template.
 const SPEED_PLACEHOLDER: &str = "{speed}";
 /// The kind whose pool `--planners` sizes.
 const PATH_PLANNER: &str = "PathPlanner";
-/// In the arguments of a template: the system's robot.
+/// Placeholder for the system's robot in the arguments of a template.
 const ROBOT_PLACEHOLDER: &str = "{robot}";
-/// What a cell provides, one of each, besides the modules of its robot.
+/// What a cell provides once, in addition to the modules of its robot.
 const BATTERY: &str = "Battery";
 const SPEEDS: std::ops::RangeInclusive<f64> = 0.01..=1000.0;
 
@@ -43,19 +43,19 @@ const SPEEDS: std::ops::RangeInclusive<f64> = 0.01..=1000.0;
 pub(crate) struct SystemConfig {
     /// Robot's seconds per second, for all roles.
     pub(crate) speed: f64,
-    /// The robot, for all roles: the name of a built-in one, or the path of a `robot.toml`, seen from the folder of the config.
+    /// The robot, for all roles: the name of a built-in one, or the path of a `robot.toml`, relative to the folder of the config.
     pub(crate) robot: String,
-    /// What surrounds every daemon.
+    /// Settings shared by all daemons.
     pub(crate) service: ServiceConfig,
     pub(crate) resource_manager: ResourceManagerConfig,
     pub(crate) world_pool: WorldPoolConfig,
     pub(crate) process_manager: ProcessManagerConfig,
     pub(crate) cell: CellConfig,
-    /// What the catalogue is made of: `built-in`, and files, found from the folder of this one. What `catalogue` says then comes on top.
+    /// The parts of the catalogue: `built-in`, and files relative to the folder of this one. `catalogue` overrides them.
     pub(crate) catalogues: Vec<String>,
-    /// What tasks are checked against.
+    /// The catalogue that tasks are checked against.
     pub(crate) catalogue: Catalogue,
-    /// What the robot has.
+    /// The parts of the robot.
     #[serde(skip)]
     parts: Parts,
 }
@@ -77,30 +77,30 @@ impl Default for SystemConfig {
     }
 }
 
-/// What a robot has of what a cell can have.
+/// The parts of a robot that matter for a cell.
 #[derive(Debug, Clone, PartialEq)]
 struct Parts {
     modules: Vec<Module>,
     joints: ArmJoints,
-    /// Which those are.
+    /// The names of these joints.
     chain: Option<JointChain>,
-    /// The attributes of the modules of a kind, one after the other: the cell's host, and of a robot with several arms which one each is.
+    /// The attributes of the modules of each kind, in order: the cell's host, and for a robot with several arms the arm.
     attributes: ModuleAttributes,
-    /// Whether its workplace has a middle, into which several arms reach.
+    /// Whether its workplace has a middle, which several arms reach.
     middle: bool,
 }
 
-/// By the kind of a module, for each module of this kind.
+/// For each kind of module, the attributes of each module.
 type ModuleAttributes = BTreeMap<String, Vec<BTreeMap<String, Value>>>;
 
-/// How many joints an arm of the robot has.
+/// The number of joints of the robot's arm.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum ArmJoints {
-    /// As the catalogue says.
+    /// As in the catalogue.
     AsSaid,
-    /// So many.
+    /// This number.
     Count(u32),
-    /// One arm has more than another: what a goal gives is not checked.
+    /// Different arms have different numbers: the number in a goal is not checked.
     Various,
 }
 
@@ -117,8 +117,8 @@ impl Default for Parts {
 }
 
 impl Parts {
-    /// What the robot does not have is not offered, unless a template or a provider of one's own offers it; and its arm has as many joints as
-    /// it has. Providers of one's own are as they say.
+    /// Removes what the robot does not have, unless a template or a user-defined provider offers it, and sets the arm's number of joints.
+    /// User-defined providers are unchanged.
     fn fit(&self, catalogue: &mut Catalogue, templates: &[Template]) {
         let standard = Catalogue::standard();
         let lacks = |kind: &str| {
@@ -152,12 +152,12 @@ impl Parts {
 }
 
 impl SystemConfig {
-    /// Reads and checks a config, or the built-in one; a bad one is refused.
+    /// Reads and checks a config, or the built-in one; an invalid one is refused.
     pub(crate) fn load(file: Option<&Path>) -> Result<SystemConfig, Failure> {
         SystemConfig::load_for(file, None)
     }
 
-    /// As [`SystemConfig::load`], for the robot that the command line names.
+    /// As [`SystemConfig::load`], with the robot named on the command line.
     pub(crate) fn load_for(file: Option<&Path>, robot: Option<&str>) -> Result<SystemConfig, Failure> {
         let parsed = match file {
             None => SystemConfig::parse(DEFAULT, DEFAULT_NAME, Path::new(""), robot),
@@ -166,7 +166,7 @@ impl SystemConfig {
         parsed.map_err(|error| Failure::Refused(format!("ratn: {error:#}")))
     }
 
-    /// What each daemon listens on, by role.
+    /// The listen address of each daemon, by role.
     pub(crate) fn listens(&self) -> [(&'static str, &Endpoint); 4] {
         [
             (resource_manager::ROLE, &self.resource_manager.listen),
@@ -187,7 +187,7 @@ impl SystemConfig {
         SystemConfig::parse(&text, &name, file.parent().unwrap_or(Path::new("")), robot)
     }
 
-    /// `folder` is where the config is; `robot` is instead of its own.
+    /// `folder` is the config's folder; `robot` overrides the config's robot.
     fn parse(text: &str, name: &str, folder: &Path, robot: Option<&str>) -> anyhow::Result<SystemConfig> {
         let mut config: SystemConfig =
             toml::from_str(text).map_err(|error| anyhow::anyhow!("{name}: {}", error.to_string().trim_end()))?;
@@ -231,8 +231,8 @@ impl SystemConfig {
         self.cell.check().context("[cell]")
     }
 
-    /// Makes the catalogue of what it is made of. Workers of the built-in one that no template of this config starts are not there, unless its
-    /// own section says how many there are.
+    /// Composes the catalogue. Workers of the built-in catalogue that no template of this config starts are removed, unless the config's own
+    /// catalogue section declares them.
     fn compose(&mut self, folder: &Path) -> anyhow::Result<()> {
         if self.catalogues.is_empty() {
             return Ok(());
@@ -240,7 +240,7 @@ impl SystemConfig {
         let names = std::mem::take(&mut self.catalogues);
         let (mut composed, built_in) = catalogue::compose(&names, folder).context("`catalogues`")?;
         let own = std::mem::take(&mut self.catalogue);
-        // Left out of the file, it is the built-in one.
+        // If the file has no catalogue section, it is the built-in one.
         let mut declared = BTreeSet::new();
         if own != Catalogue::standard() {
             declared.extend(own.resources.keys().cloned());
@@ -253,10 +253,10 @@ impl SystemConfig {
         Ok(())
     }
 
-    /// What follows from the robot: what it does not have is not offered, and its arm has as many joints as it has.
+    /// Applies the robot: parts that it does not have are not offered, and the arm's number of joints is set.
     fn fit_robot(&mut self) -> anyhow::Result<()> {
         self.cell.robot.clone_from(&self.robot);
-        // The built-in configuration has all that the standard robot has; only the names of its joints are not in it.
+        // The built-in config has everything that the standard robot has, except the names of its joints.
         if self.robot == AIMM {
             self.parts.chain = Robot::built_in_description(AIMM).map(|robot| JointChain {
                 robot: robot.name,
@@ -277,7 +277,7 @@ impl SystemConfig {
                 Some(count) if counts.len() == 1 => ArmJoints::Count(u32::try_from(*count)?),
                 _ => ArmJoints::Various,
             };
-            // Of several arms nobody knows here which one a goal is for.
+            // With several arms it is unknown here which one a goal is for.
             let chain = robot.other_arms().next().is_none().then(|| JointChain {
                 robot: robot.name().to_owned(),
                 arm: robot.arm_name().to_owned(),
@@ -299,7 +299,7 @@ impl SystemConfig {
         self.process_manager_config().templates.iter().try_for_each(|template| self.check_told(template))
     }
 
-    /// A bundled worker is for the robot of the system. `{robot}` is filled in.
+    /// Checks that a bundled worker gets the system's robot. `{robot}` is substituted.
     fn check_told(&self, template: &Template) -> anyhow::Result<()> {
         let Template { name, program, python, args, .. } = template;
         let is_ratn = program.as_ref().is_none_or(|program| Path::new(program).file_name() == Some("ratn".as_ref()));
@@ -320,8 +320,8 @@ impl SystemConfig {
         }
     }
 
-    /// What follows from the rest: one speed for all, and as many workers in the catalogue as the templates can provide.
-    /// A kind that no template provides is in a catalogue of one's own for another host's sake; not in the built-in one.
+    /// Derives dependent settings: the same speed everywhere, and as many workers in the catalogue as the templates can provide. A kind that
+    /// no template provides stays in a user-defined catalogue, because another host may provide it; it is removed from the built-in one.
     fn settle(&mut self) {
         self.cell.speed = self.speed;
         let mut standard = Catalogue::standard();
@@ -337,7 +337,7 @@ impl SystemConfig {
         });
     }
 
-    /// What a client of this system trusts and shows: what the environment says, else as `[service.tls]` does.
+    /// The TLS settings of clients of this system: from the environment, else from `[service.tls]`.
     pub(crate) fn client_tls(&self, from_environment: &ClientTls) -> Result<ClientTls, Failure> {
         let read = self.service.client_tls(from_environment).context("[service.tls]");
         read.map_err(|error| {
@@ -345,7 +345,7 @@ impl SystemConfig {
         })
     }
 
-    /// With what the command line says.
+    /// Applies the command line.
     pub(crate) fn apply(&mut self, arguments: &SystemArguments) {
         self.speed = arguments.speed.unwrap_or(self.speed);
         self.cell.scene = arguments.scene.unwrap_or(self.cell.scene);
@@ -365,14 +365,14 @@ impl SystemConfig {
         self.settle();
     }
 
-    /// The same at another speed.
+    /// The same config at another speed.
     pub(crate) fn at_speed(mut self, speed: f64) -> SystemConfig {
         self.speed = speed;
         self.settle();
         self
     }
 
-    /// The process manager's section with the speed filled in.
+    /// The process manager's section with speed and robot substituted.
     pub(crate) fn process_manager_config(&self) -> ProcessManagerConfig {
         let mut config = self.process_manager.clone();
         for argument in config.templates.iter_mut().flat_map(|t| &mut t.args) {
@@ -382,7 +382,7 @@ impl SystemConfig {
         config
     }
 
-    /// How much of each kind is there once the system is ready.
+    /// The amount of each kind that exists once the system is ready.
     pub(crate) fn promised_resources(&self) -> BTreeMap<String, Quantity> {
         let mut promised: BTreeMap<String, Quantity> = BTreeMap::new();
         let middle = self.parts.middle.then_some(MIDDLE);
@@ -396,25 +396,25 @@ impl SystemConfig {
         promised
     }
 
-    /// Whether resources of a kind are the robot's own arms or grippers, and no worker's.
+    /// Whether resources of a kind are the robot's arms or grippers, and not a worker's.
     pub(crate) fn is_module_of_arm(&self, kind: &str) -> bool {
         let is_of_arm = |module: &Module| module.kind() == kind && module.arm().is_some();
         self.parts.modules.iter().any(is_of_arm)
             && self.process_manager.templates.iter().all(|template| template.kind != kind)
     }
 
-    /// On which host each module of a kind is, and of which arm where the robot has several.
+    /// The host of each module of a kind, and its arm where the robot has several.
     pub(crate) fn module_attributes(&self) -> &ModuleAttributes {
         &self.parts.attributes
     }
 
-    /// The same config as a file.
+    /// The config as TOML.
     pub(crate) fn to_toml(&self) -> anyhow::Result<String> {
         toml::to_string(self).context("cannot write the config")
     }
 }
 
-/// What a worker's arguments say of its robot, in one word or in two.
+/// The robot in a worker's arguments, as `--robot=NAME` or `--robot NAME`.
 fn told(args: &[String]) -> Option<&str> {
     let after = |i: usize| args.get(i + 1).map(String::as_str);
     args.iter().enumerate().find_map(|(i, argument)| match argument.strip_prefix("--robot") {
@@ -424,14 +424,14 @@ fn told(args: &[String]) -> Option<&str> {
     })
 }
 
-/// Whether two say the same robot: a built-in one by its name, another by its file.
+/// Whether both name the same robot: a built-in one by its name, any other by its file.
 pub(crate) fn is_same(one: &str, other: &str) -> bool {
     let is_built_in = |robot: &str| Robot::built_in_names().any(|name| name == robot);
     let file = |robot: &str| Path::new(robot).canonicalize().ok();
     one == other || !is_built_in(one) && !is_built_in(other) && file(one).is_some() && file(one) == file(other)
 }
 
-/// A robot as processes elsewhere find it: a built-in one by its name, another by its whole path.
+/// A robot as processes in other folders find it: a built-in one by its name, any other by its absolute path.
 fn absolute(robot: &str, folder: &Path) -> anyhow::Result<String> {
     anyhow::ensure!(!robot.is_empty(), "`robot` is empty: name a built-in robot, or the path of a robot.toml");
     if Robot::built_in_names().any(|name| name == robot) {
@@ -585,7 +585,7 @@ mod tests {
         assert_eq!(catalogue.resources["Inspector"].count, 3);
         assert!(catalogue.providers.contains_key("inspector") && catalogue.providers.contains_key("arm"));
         assert!(catalogue.resources.contains_key("Arm") && !catalogue.resources.contains_key(PATH_PLANNER));
-        // Whoever reads what was written needs no other file.
+        // The written config needs no other file.
         assert_eq!(parse(&config.to_toml().unwrap(), "elsewhere.toml").unwrap(), config);
         let refused = format!("{:#}", parse("catalogues = [\"no.toml\"]", "x.toml").unwrap_err());
         assert!(refused.starts_with("x.toml: `catalogues`: cannot read the catalogue no.toml"), "{refused}");
@@ -600,7 +600,7 @@ mod tests {
         assert!(format!("{:#}", refusal("[world-pool]\ncapacity = 0")).contains("[world-pool]: `capacity`"));
     }
 
-    /// Every key that holds a value, as the way to it, with the built-in config for an example.
+    /// Collects the path to every key with a value, with the built-in config as the example.
     fn keys(value: &toml::Value, way: &mut Vec<String>, all: &mut Vec<Vec<String>>) {
         match value {
             toml::Value::Table(table) => table.iter().for_each(|(key, value)| {
@@ -647,7 +647,7 @@ mod tests {
         for way in all {
             // A list of numbers is named by the list.
             let key = way.iter().rev().find(|step| step.parse::<usize>().is_err()).unwrap();
-            // No key is a date; what else may be one, and then it is as the key wants it.
+            // No key expects a date; where a string is allowed, a date is valid as the key requires.
             let refused = parse(&replaced(&config, &way, date.clone()), "x.toml").unwrap_err();
             assert!(format!("{refused:#}").contains(key.as_str()), "{way:?}: {refused:#}");
             for value in &odd {

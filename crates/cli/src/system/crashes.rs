@@ -1,18 +1,18 @@
-//! Workers that crash while a system is started: the first crash of each pool is told at once, and a pool that has given up while its workers
-//! are missing is the end of the start. What is missing and what pools say comes from outside; this keeps what was told already.
+//! Worker crashes while a system starts: the first crash of each pool is reported at once, and a pool that has given up while its workers are
+//! missing ends the start. The caller provides the missing kinds and the pools' status; this module remembers what was reported.
 
 use ratn_proto::types::PoolStatus;
 use std::collections::BTreeSet;
 
-/// What was told of crashes since the start began.
+/// The crashes reported since the start began.
 #[derive(Debug, Default)]
 pub(super) struct Crashes {
-    /// Templates of which a worker has crashed.
+    /// Templates of which a crash was reported.
     told: BTreeSet<String>,
 }
 
 impl Crashes {
-    /// A sentence for each pool of which the first crash has just been seen. What is tried again may still come.
+    /// A sentence for each pool whose first crash is new. Pools that still restart their workers may recover.
     pub(super) fn news(&mut self, pools: &[PoolStatus]) -> Vec<String> {
         let crashed = pools.iter().filter(|pool| pool.crashes > 0 && pool.failure.is_empty());
         let new = crashed.filter(|pool| self.told.insert(pool.template.clone()));
@@ -21,7 +21,7 @@ impl Crashes {
     }
 }
 
-/// Why the workers that are missing will not come, where their pools start none any more. `missing` are kinds of resources.
+/// Why missing workers will not come, where their pools have given up. `missing` are kinds of resources.
 pub(super) fn given_up(pools: &[PoolStatus], missing: &BTreeSet<&str>) -> Option<String> {
     let failed = pools.iter().filter(|pool| !pool.failure.is_empty() && missing.contains(pool.kind.as_str()));
     let why: Vec<String> = failed.map(|pool| format!("`{}` crash-loops: {}", pool.template, pool.failure)).collect();
@@ -54,7 +54,7 @@ mod tests {
         let said = "a worker of `eye` has crashed and is started again: eye-2@compute: exited with status 1";
         assert_eq!(told, [said]);
         assert_eq!(crashes.news(&[pool("eye", 3, ""), pool("ear", 1, "")]).len(), 1);
-        // One that has given up starts none again.
+        // A pool that has given up restarts no worker.
         assert_eq!(Crashes::default().news(&[pool("eye", 5, "5 crashes in a row")]), Vec::<String>::new());
     }
 

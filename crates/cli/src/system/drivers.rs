@@ -1,6 +1,6 @@
-//! The drivers of a system: who moves something, and serves emergency stop and hold for it.
+//! The drivers of a system: processes that move something, and serve emergency stop and hold for it.
 //!
-//! They are whoever offers a resource of class module, or a process with a bound for its standstill.
+//! A driver offers a resource of class module, or a process with a standstill bound.
 
 use futures::future::join_all;
 use ratn_daemon::resource_manager;
@@ -14,7 +14,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 use tokio::time::timeout;
 
-/// What is in force at each driver, or why it is not known.
+/// The safety state of each driver, or why it is unknown.
 pub(crate) type Answers = BTreeMap<Endpoint, Result<SafetyState, String>>;
 
 /// The drivers of these resources.
@@ -27,10 +27,10 @@ pub(crate) fn among<'a>(resources: impl IntoIterator<Item = &'a Resource>) -> BT
     resources.into_iter().filter(moves).filter_map(|resource| resource.endpoint().parse().ok()).collect()
 }
 
-/// The drivers that the resource manager tells of.
+/// The drivers that the resource manager lists.
 ///
 /// # Errors
-/// Why it does not, also where it does not within `patience`.
+/// Why there is no list; also where there is no answer within `patience`.
 pub(crate) async fn offered(
     channels: &Channels,
     directory: &RuntimeDirectory,

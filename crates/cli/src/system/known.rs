@@ -1,7 +1,7 @@
-//! The config of the system in a runtime directory, for a command that goes on while systems and workers come and go: its catalogue is
-//! extended by what the workers say of themselves, as that of `ratn run` is.
+//! The config of the system in a runtime directory, for a command that outlasts systems and workers: its catalogue is extended by the
+//! workers' descriptions, as in `ratn run`.
 //!
-//! It owns the last answer and its age. A page that checks at every key that is pressed does not ask the workers as often.
+//! The last answer is cached with its age. So a page that checks at every keystroke does not ask the workers each time.
 
 use super::config::SystemConfig;
 use super::workers::Offered;
@@ -13,14 +13,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::runtime::Handle;
 
-/// An answer is good for so long.
+/// How long an answer is valid.
 const KEPT: Duration = Duration::from_secs(5);
-/// A system that has not answered by then is known by its config alone.
+/// Timeout of a system; without its answer only its config is known.
 const PATIENCE: Duration = Duration::from_secs(6);
 
 type Look = dyn Fn() -> Result<SystemConfig, String> + Send + Sync;
 
-/// What is known of the system in a runtime directory.
+/// The known config of the system in a runtime directory.
 #[derive(Clone)]
 pub(crate) struct KnownSystem(Arc<Inner>);
 
@@ -30,7 +30,7 @@ struct Inner {
 }
 
 impl KnownSystem {
-    /// Of the system that runs, or ran, in a directory; without one, the built-in config.
+    /// For the system that runs, or ran, in a directory; without one, the built-in config.
     pub(crate) fn of(directory: PathBuf, tls: ClientTls) -> KnownSystem {
         KnownSystem::by(move || look(&directory, &tls))
     }
@@ -39,10 +39,10 @@ impl KnownSystem {
         KnownSystem(Arc::new(Inner { look: Box::new(look), last: Mutex::new(None) }))
     }
 
-    /// Its config as it is known now. Waits for the system: to be called where a thread of a runtime may block.
+    /// The config as known now. Waits for the system: call it only on a thread that may block.
     ///
     /// # Errors
-    /// Why there is not even the built-in config, in a sentence.
+    /// Why there is not even the built-in config, as a sentence.
     pub(crate) fn config(&self) -> Result<Arc<SystemConfig>, String> {
         let mut last = self.0.last.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((when, config)) = &*last
@@ -62,7 +62,7 @@ impl Debug for KnownSystem {
     }
 }
 
-/// The config without what workers say.
+/// The config without the workers' descriptions.
 ///
 /// # Errors
 /// As [`KnownSystem::config`].
@@ -102,7 +102,7 @@ mod tests {
         let (first, second) = (known.config().unwrap(), known.config().unwrap());
         assert!(Arc::ptr_eq(&first, &second));
         assert_eq!(asked.load(Ordering::Relaxed), 2);
-        // What is old is asked for anew.
+        // An old answer is replaced.
         let old = Instant::now().checked_sub(KEPT).unwrap();
         *known.0.last.lock().unwrap() = Some((old, first));
         known.config().unwrap();

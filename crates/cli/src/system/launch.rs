@@ -1,9 +1,8 @@
-//! Starting a whole system on this machine as children of this process, and ending it again whatever happens.
+//! Starts a whole system on this machine as children of this process, and ends it again whatever happens.
 //!
-//! Every child is this very binary in one of its roles, in a process group of its own (Ctrl-C reaches only this process, which
-//! then ends them in order), with a pipe as standard input whose end tells it that this process is gone, and with its output in
-//! a log file of the runtime directory. A system is ready when every role has published its endpoint and every resource that
-//! the config promises is there.
+//! Every child is this same binary in one of its roles, in a separate process group (Ctrl-C reaches only this process, which then ends the
+//! children in order). Its standard input is a pipe that closes when this process ends, and its output goes to a log file in the runtime
+//! directory. A system is ready when every role has published its endpoint and every resource that the config promises exists.
 
 use super::patience::{Patience, Verdict, processor_time};
 use crate::output;
@@ -19,11 +18,11 @@ use std::time::{Duration, Instant};
 use tokio::process::Child;
 
 const POLL: Duration = Duration::from_millis(10);
-/// So often it is looked whether what is missing works.
+/// Interval at which the activity of missing parts is checked.
 const LOOK: Duration = Duration::from_secs(1);
-/// From SIGTERM to SIGKILL, for all roles together.
+/// Time from SIGTERM to SIGKILL, for all roles together.
 const STOP_DEADLINE: Duration = Duration::from_secs(3);
-/// How much of a dead child's log is shown.
+/// Bytes of a dead child's log that are shown.
 const LAST_WORDS_BYTES: u64 = 2000;
 
 /// One role as a child process.
@@ -57,7 +56,7 @@ impl RoleProcess {
         Ok(RoleProcess { role, child, log })
     }
 
-    /// An error with its last words when it has ended.
+    /// An error with the end of its log when it has ended.
     pub(crate) fn check_running(&mut self) -> anyhow::Result<()> {
         if let Some(status) = self.child.try_wait()? {
             bail!("{} ended ({status}); the end of {}:\n{}", self.role, self.log.display(), last_words(&self.log));
@@ -79,16 +78,16 @@ pub(crate) struct Processes {
 }
 
 impl Processes {
-    /// Starts them, all at once: each waits for those that it needs.
+    /// Starts all of them at once: each waits for the roles that it needs.
     pub(crate) fn start(roles: &[&'static str], config: &Path, directory: &Path) -> anyhow::Result<Processes> {
         let roles = roles.iter().map(|role| RoleProcess::start(role, config, directory)).collect::<Result<_, _>>()?;
         Ok(Processes { roles })
     }
 
-    /// Waits until nothing is `missing`: what is not there yet, for people; roles by their names.
+    /// Waits until nothing is `missing`, which returns the missing parts, for people; roles by their names.
     ///
     /// # Errors
-    /// What `missing` gives where waiting is in vain; or when a process ends, or when the [`Patience`] does, with the last words of the log.
+    /// The error of `missing` where waiting is in vain; or when a process ends, or when the [`Patience`] is over, with the end of the log.
     pub(crate) async fn wait_until<F>(&mut self, mut missing: F) -> anyhow::Result<()>
     where
         F: AsyncFnMut() -> anyhow::Result<Vec<String>>,
@@ -139,7 +138,7 @@ impl Processes {
         self.roles.iter_mut().try_for_each(RoleProcess::check_running)
     }
 
-    /// Resolves when one of them ends, with what is known of it.
+    /// Resolves with an error when one of them ends.
     pub(crate) async fn one_ended(&mut self) -> anyhow::Error {
         loop {
             if let Err(error) = self.check_running() {
@@ -149,7 +148,7 @@ impl Processes {
         }
     }
 
-    /// Ends them: those started last first, hard where they do not end by themselves.
+    /// Ends them, last started first; kills those that do not end by themselves.
     pub(crate) async fn stop(mut self) {
         let start = Instant::now();
         for process in self.roles.iter_mut().rev() {
@@ -181,7 +180,7 @@ fn last_words(log: &Path) -> String {
     )
 }
 
-/// What of `wanted` (resources by kind) is not among `there`: by kind, for people.
+/// The part of `wanted` (resources by kind) that is not in `there`: by kind, for people.
 pub(crate) fn missing<'a>(
     wanted: &'a BTreeMap<String, Quantity>,
     there: &BTreeMap<String, Quantity>,

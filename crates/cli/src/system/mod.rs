@@ -36,29 +36,29 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use workers::Offered;
 
-/// The environment variable that says where endpoint files are.
+/// The environment variable with the directory of endpoint files.
 pub(crate) const DIRECTORY_VARIABLE: &str = "RATN_RUNTIME_DIR";
-/// In a runtime directory: the config of the system that runs there.
+/// The file in a runtime directory with the config of the system that runs there.
 pub(crate) const CONFIG_FILE: &str = "system.toml";
 const CELL: &str = "cell";
 const PROCESS_MANAGER: &str = "process-manager";
-/// While workers are missing at the start, their process manager is asked for the reason so often.
+/// Interval at which the process manager is asked why workers are missing at the start.
 const ASK_POOLS: Duration = Duration::from_millis(250);
 /// The kinds of objects that have to be carried upright.
 const UPRIGHT: [&str; 2] = ["bowl", "cup"];
 
-/// What really came of a task, by the cell's ground truth.
+/// The true result of a task, according to the cell's ground truth.
 #[derive(Debug)]
 pub(crate) struct Judgement {
-    /// How many objects are where the task was to bring them.
+    /// Number of objects that are where the task was to bring them.
     pub(crate) delivered: usize,
-    /// How far a bowl or a cup leaned at the most while it was held, in radians.
+    /// Maximum tilt of a bowl or a cup while it was held, in radians.
     pub(crate) greatest_tilt_rad: f64,
-    /// What touched that should not have.
+    /// Unintended contacts.
     pub(crate) unintended_contacts: Vec<UnintendedContact>,
 }
 
-/// The roles of a system on one machine, in the order in which they are started.
+/// The roles of a system on one machine, in the order of starting.
 const ROLES: [&str; 4] = ["resource-manager", "world-pool", CELL, PROCESS_MANAGER];
 
 /// A running system.
@@ -66,28 +66,28 @@ const ROLES: [&str; 4] = ["resource-manager", "world-pool", CELL, PROCESS_MANAGE
 pub(crate) struct System {
     pub(crate) config: SystemConfig,
     pub(crate) endpoints: Endpoints,
-    /// What there is in one that was found running.
+    /// The resources of a system that was found running.
     pub(crate) offered: Offered,
-    /// Where its catalogue and its workers say something else.
+    /// Differences between its catalogue and its workers.
     pub(crate) mismatches: Vec<String>,
-    /// What its clients trust and show.
+    /// The TLS settings of its clients.
     tls: ClientTls,
     directory: RuntimeDirectory,
     processes: Processes,
-    /// Removed with it.
+    /// A private directory, removed together with the system.
     _private: Option<tempfile::TempDir>,
 }
 
 impl System {
-    /// Starts one in a directory of its own, which goes with it.
+    /// Starts a system in a private directory, which is removed with it.
     pub(crate) async fn start_private(config: SystemConfig, tls: &ClientTls) -> anyhow::Result<System> {
         let private = tempfile::Builder::new().prefix("ratn-").tempdir().context("cannot make a runtime directory")?;
         let path = private.path().to_owned();
-        // Boxed: it holds the config of every role.
+        // Boxed, because it holds the config of every role.
         Box::pin(System::start(config, &path, Some(private), tls)).await
     }
 
-    /// Starts one that others find in `directory`.
+    /// Starts a system that others find in `directory`.
     pub(crate) async fn start_public(
         config: SystemConfig,
         directory: &Path,
@@ -110,8 +110,7 @@ impl System {
         let mut config = config;
         let kept = [&mut config.resource_manager.storage, &mut config.world_pool.storage];
         for (role, storage) in ROLES.iter().zip(kept).filter(|(_, storage)| storage.directory.is_none()) {
-            // All of it starts and ends together: whose resources and what world these were is gone with the last system that was
-            // here.
+            // All roles start and end together: the resources and the world of the last system that was here are gone with it.
             forget_state(&directory, role)?;
             storage.durability = Durability::None;
         }
@@ -134,8 +133,8 @@ impl System {
         }
     }
 
-    /// The one that runs in `directory`, if one does. Without a config of your own it is the one that it was started with. Its workers
-    /// extend its catalogue by what they say of themselves.
+    /// The system that runs in `directory`, if there is one. Without `config` it uses the one with which the system was started. Its workers'
+    /// descriptions extend its catalogue.
     pub(crate) async fn find(
         directory: &Path,
         config: Option<SystemConfig>,
@@ -159,17 +158,17 @@ impl System {
         }))
     }
 
-    /// Asks once more what there is: workers may have come since.
+    /// Asks again for the resources: workers may have come since.
     pub(crate) async fn ask_again(&mut self) {
         self.offered = Box::pin(Offered::known(&self.tls, &self.endpoints.resource_manager)).await;
         self.mismatches = self.offered.mismatches(&self.config.catalogue);
         self.offered.extend(&mut self.config.catalogue);
     }
 
-    /// Where a run finds what it needs of it. From here on the run sends its spans where the daemons send theirs.
+    /// The addresses and settings that a run needs. From here on the run sends its spans where the daemons send theirs.
     pub(crate) fn place(&self) -> Place {
         let resource = vec![("service.name", "ratn".to_owned())];
-        // The config was checked.
+        // The config was checked, so this succeeds.
         let _ = ratn_otlp::start(&self.config.service.otlp, resource, |said| {
             output::progress(format_args!("warning: {said}"));
         });
@@ -187,17 +186,17 @@ impl System {
         }
     }
 
-    /// Where its endpoint files and logs are.
+    /// The directory of its endpoint files and logs.
     pub(crate) fn directory(&self) -> &RuntimeDirectory {
         &self.directory
     }
 
-    /// Resolves when one of the processes that were started for it ends, with what is known of it.
+    /// Resolves with an error when one of the processes that were started for it ends.
     pub(crate) async fn one_ended(&mut self) -> anyhow::Error {
         self.processes.one_ended().await
     }
 
-    /// What really came of a task, as only the cell knows.
+    /// The true result of a task, which only the cell knows.
     pub(crate) async fn judgement(&self) -> anyhow::Result<Judgement> {
         let channel = Channels::new(&self.tls).get(&self.directory.find(CELL)?)?;
         let truth = CellServiceClient::new(channel).get_ground_truth(GetGroundTruthRequest {}).await;
@@ -210,7 +209,7 @@ impl System {
         })
     }
 
-    /// What to know of a system that others have used: its facts stay, and things stand where they were left.
+    /// A notice about a system that was used before: its facts remain, and objects are where they were left.
     pub(crate) async fn left_behind(&self) -> Option<String> {
         let world = WorldClient::new(&Channels::new(&self.tls), &self.endpoints.world_pool).ok()?;
         let (_, facts) = world.root().await.ok()?;
@@ -223,16 +222,16 @@ impl System {
             .then(|| format!("its world has {many} from before, and things are where earlier runs left them{reset}"))
     }
 
-    /// Ends what was started for it.
+    /// Ends the processes that were started for it.
     pub(crate) async fn stop(self) {
         self.processes.stop().await;
     }
 }
 
-/// A path of a Unix socket has so many bytes at the most (`sun_path` has 108, one of them ends it).
+/// Maximum length of a Unix socket path in bytes (`sun_path` has 108, with the final zero).
 const MAX_SOCKET_PATH: usize = 107;
 
-/// Refuses a directory that is too deep for the sockets of these roles, which listen so, before anything is started.
+/// Refuses a directory that is too deep for the sockets of these roles, before anything is started.
 pub(crate) fn sockets_fit(listens: &[(&str, &Endpoint)], directory: &Path) -> Result<(), NotStarted> {
     let absolute = std::path::absolute(directory).unwrap_or_else(|_| directory.to_owned());
     let place = absolute.canonicalize().unwrap_or(absolute);
@@ -254,8 +253,8 @@ pub(crate) fn sockets_fit(listens: &[(&str, &Endpoint)], directory: &Path) -> Re
     )))
 }
 
-/// The config of the system that runs in `directory`. One that is given says what there is; how fast it goes and with which robot is decided
-/// already, and another robot is refused.
+/// The config of the system that runs in `directory`. A given config provides the catalogue and the rest, but the speed and the robot are those
+/// of the running system, and another robot is refused.
 fn config_of(directory: &Path, given: Option<SystemConfig>) -> anyhow::Result<SystemConfig> {
     let own = SystemConfig::read(&directory.join(CONFIG_FILE));
     match (given, own) {
@@ -284,10 +283,10 @@ fn forget_state(directory: &RuntimeDirectory, role: &str) -> anyhow::Result<()> 
     }
 }
 
-/// Where the system that runs in `directory` is reached, if one does. The files of a system that was killed do not count.
+/// The endpoints of the system that runs in `directory`, if there is one. The files of a system that was killed do not count.
 ///
 /// # Errors
-/// Somebody listens where a system did, and cannot be spoken to: it may run, under a certificate that is not trusted here.
+/// A process listens at the system's endpoint but cannot be spoken to: it may run with a certificate that is not trusted here.
 pub(crate) async fn running(directory: &Path, tls: &ClientTls) -> anyhow::Result<Option<Endpoints>> {
     let files = RuntimeDirectory::at(directory);
     let (Ok(resource_manager), Ok(world_pool)) = (files.find(ROLES[0]), files.find(ROLES[1])) else { return Ok(None) };
@@ -304,7 +303,7 @@ pub(crate) async fn running(directory: &Path, tls: &ClientTls) -> anyhow::Result
     Ok(Some(Endpoints { resource_manager, world_pool }))
 }
 
-/// Waits until every role is there and every resource that the config promises. `keeps` is the directory where it is there after a start in vain.
+/// Waits until every role and every resource that the config promises exists. `keeps` is the directory, where it remains after a failed start.
 async fn ready(
     processes: &mut Processes,
     directory: &RuntimeDirectory,
@@ -345,12 +344,12 @@ async fn ready(
     Ok(Endpoints { resource_manager: directory.find(ROLES[0])?, world_pool: directory.find(ROLES[1])? })
 }
 
-/// Where all is that workers have written.
+/// A hint where the complete logs of workers are.
 fn whole_logs(directory: &Path) -> String {
     format!(" (the whole logs of workers are in {})", directory.join("logs").display())
 }
 
-/// The pools of the process manager, as far as it says. One that does not answer yet is asked again.
+/// The pools of the process manager. A manager that does not answer yet is asked again later.
 async fn pools(channels: &Channels, directory: &RuntimeDirectory) -> Vec<PoolStatus> {
     let client = directory.find(PROCESS_MANAGER).ok().and_then(|at| ProcessClient::new(channels, &at).ok());
     let Some(client) = client else { return Vec::new() };
@@ -360,10 +359,10 @@ async fn pools(channels: &Channels, directory: &RuntimeDirectory) -> Vec<PoolSta
     }
 }
 
-/// Where endpoint files are, as [`directory_of`] says.
+/// The directory of endpoint files, as in [`directory_of`].
 ///
 /// # Errors
-/// Where they are another user's, and not to be looked at.
+/// Where it belongs to another user and may not be accessed.
 pub(crate) fn public_directory(given: Option<&Path>) -> Result<PathBuf, Failure> {
     let directory = directory_of(given);
     match denied(&directory) {
@@ -375,7 +374,7 @@ pub(crate) fn public_directory(given: Option<&Path>) -> Result<PathBuf, Failure>
     }
 }
 
-/// Why the system in a directory is not to be spoken to: it is another user's, who lets this one neither look nor connect.
+/// Why the system in a directory may not be used: it belongs to another user, who allows this user neither to look nor to connect.
 pub(crate) fn denied(directory: &Path) -> Option<String> {
     let is = match directory.metadata() {
         Ok(is) => is,
@@ -405,7 +404,7 @@ pub(crate) fn denied(directory: &Path) -> Option<String> {
     })
 }
 
-/// Where endpoint files are unless said otherwise: as the environment says, else a directory of this user.
+/// The directory of endpoint files: as given, else as in the environment, else a directory of this user.
 pub(crate) fn directory_of(given: Option<&Path>) -> PathBuf {
     if let Some(path) = given {
         return path.to_owned();
@@ -415,7 +414,7 @@ pub(crate) fn directory_of(given: Option<&Path>) -> PathBuf {
         .unwrap_or_else(|| std::env::temp_dir().join(format!("ratn-{}", nix::unistd::getuid())))
 }
 
-/// A path that the environment says.
+/// A path from the environment.
 pub(crate) fn variable(name: &str) -> Option<PathBuf> {
     std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from)
 }
@@ -437,7 +436,7 @@ mod tests {
         let refused = sockets_fit(&config.listens(), &deep).unwrap_err().to_string();
         assert!(refused.contains("110 bytes") && refused.contains("3 bytes shorter"), "{refused}");
         assert!(!deep.exists());
-        // One role alone needs room for its own socket only.
+        // A single role only needs room for its own socket.
         assert!(sockets_fit(&[(CELL, &config.cell.listen)], &deep).is_ok());
     }
 

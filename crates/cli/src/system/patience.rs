@@ -1,21 +1,21 @@
-//! How long a system that starts is waited for: for as long as what is missing works, up to a bound.
+//! How long to wait for a starting system: for as long as the missing parts are busy, up to a bound.
 //!
-//! A cell or a worker that reads a robot with many meshes computes for many seconds before it is there, and for longer on a busy machine. Processor time
-//! tells that from a process that waits for something that never comes.
+//! A cell or a worker that reads a robot with many meshes computes for many seconds before it is ready, and for longer on a busy machine. Processor time
+//! tells such a process from one that waits for something that never comes.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-/// For so long nothing that is missing may have worked.
+/// Maximum time without activity of any missing part.
 const IDLE: Duration = Duration::from_secs(30);
-/// However much it works.
+/// Maximum time in all, however busy they are.
 const LONGEST: Duration = Duration::from_secs(600);
-/// A process that has used so much more processor time works; what only waits wakes up now and then and uses far less of it in [`IDLE`].
+/// A process that has used this much more processor time is busy; an idle one wakes up now and then and uses far less of it in [`IDLE`].
 const WORK: Duration = Duration::from_secs(1);
-/// So often it is said what is waited for.
+/// Interval at which the missing parts are printed.
 const SAID_EVERY: Duration = Duration::from_secs(10);
 
-/// What the kernel counts processor time in, for programs (`proc_pid_stat(5)`): Linux has had it at a hundredth of a second on every machine.
+/// Unit of processor time in `proc_pid_stat(5)`: Linux shows programs hundredths of a second on every machine.
 const TICK: Duration = Duration::from_millis(10);
 
 /// See the module.
@@ -24,28 +24,28 @@ pub(super) struct Patience {
     began: Instant,
     worked: Instant,
     said: Instant,
-    /// Of each process the processor time that it had when it was last found to work.
+    /// For each process, its processor time when it was last found busy.
     counted: BTreeMap<u32, Duration>,
 }
 
-/// What comes of a look.
+/// The result of a check.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Verdict {
-    /// Waits on.
+    /// Wait on.
     Wait,
-    /// The same, and those who watch are told for how long already.
+    /// Wait on, and print how long it has taken so far.
     Say(Duration),
-    /// It is in vain: for how long it was waited, and why.
+    /// Waiting is in vain: how long it was, and why.
     GiveUp(Duration, &'static str),
 }
 
 impl Patience {
-    /// What is waited for was started now.
+    /// Begins to wait for processes that were started now.
     pub(super) fn new(now: Instant) -> Patience {
         Patience { began: now, worked: now, said: now, counted: BTreeMap::new() }
     }
 
-    /// The processor time that the processes have used by now that are waited for.
+    /// Checks the processor time that the awaited processes have used so far.
     pub(super) fn look(&mut self, now: Instant, used: &BTreeMap<u32, Duration>) -> Verdict {
         for (pid, used) in used {
             let counted = self.counted.entry(*pid).or_default();
@@ -68,13 +68,13 @@ impl Patience {
     }
 }
 
-/// The processor time of some processes, and of all that these and `parents` have started.
+/// The processor time of some processes, and of all descendants of these and of `parents`.
 pub(super) fn processor_time(of: &[u32], parents: &[u32]) -> BTreeMap<u32, Duration> {
     let entries = std::fs::read_dir("/proc").into_iter().flatten().flatten();
     let pids = entries.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
     let all: BTreeMap<u32, (u32, Duration)> = pids.filter_map(|pid| Some((pid, stat(pid)?))).collect();
     let is_below = |pid: u32| {
-        // No chain of parents is longer than there are processes.
+        // The chain of parents is bounded by the number of processes.
         let above = std::iter::successors(Some(pid), |pid| all.get(pid).map(|(parent, _)| *parent));
         above.skip(1).take(all.len()).any(|above| of.contains(&above) || parents.contains(&above))
     };
@@ -82,10 +82,10 @@ pub(super) fn processor_time(of: &[u32], parents: &[u32]) -> BTreeMap<u32, Durat
     counts.map(|(pid, (_, used))| (*pid, *used)).collect()
 }
 
-/// The parent of a process, and the processor time that it has used.
+/// The parent of a process, and its processor time.
 fn stat(pid: u32) -> Option<(u32, Duration)> {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-    // The name before may have spaces and parentheses.
+    // The name in the field before may contain spaces and parentheses.
     let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
     let ticks = |field: usize| fields.get(field)?.parse::<u32>().ok();
     Some((fields.get(1)?.parse().ok()?, TICK * ticks(11)?.checked_add(ticks(12)?)?))
@@ -96,7 +96,7 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
 
-    /// What comes of a look at every second at a process that uses so much of each.
+    /// The result of checking every second a process that uses this percentage of a processor.
     fn after(percent: u32) -> (Duration, &'static str) {
         let began = Instant::now();
         let mut patience = Patience::new(began);
@@ -114,7 +114,7 @@ mod tests {
     fn what_works_is_waited_for_up_to_a_bound_and_what_does_not_work_for_30_s() {
         let (waited, why) = after(0);
         assert!(waited == IDLE && why.contains("processor time"), "{waited:?} {why}");
-        // A daemon that waits.
+        // A daemon that only waits.
         assert_eq!(after(1).0, IDLE);
         // The share of one process among many on a busy machine.
         let (waited, why) = after(5);

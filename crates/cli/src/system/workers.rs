@@ -1,5 +1,5 @@
-//! What the workers of a running system say of themselves. It extends the catalogue that tasks are checked against; where the catalogue
-//! says something else, that is told.
+//! The descriptions of a running system's workers. They extend the catalogue that tasks are checked against; differences from the
+//! catalogue are reported.
 
 use ratn_daemon::process_manager::HOST_KIND;
 use ratn_model::catalogue::{Catalogue, WorkerDescription};
@@ -12,31 +12,31 @@ use ratn_worker::tls::ClientTls;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-/// A worker that has not described itself by then does not.
+/// Timeout of a worker's description.
 const PATIENCE: Duration = Duration::from_secs(2);
-/// All of a system that has not answered by then is not known.
+/// Timeout for the whole system.
 const PATIENCE_OF_ALL: Duration = Duration::from_secs(5);
-/// Workers that are asked, the first by their ids.
+/// Maximum number of workers that are asked, the first by id.
 const MOST_ASKED: usize = 128;
 
-/// What there is in a running system.
+/// What a running system offers.
 #[derive(Debug, Default)]
 pub(crate) struct Offered {
     /// The workers that were asked.
     pub(crate) workers: Vec<Described>,
-    /// How much there is of each kind of resource.
+    /// The amount of each kind of resource.
     pub(crate) kinds: BTreeMap<String, Quantity>,
     /// Kinds of which a process manager can start workers.
     pub(crate) startable: BTreeSet<String>,
-    /// Kinds of which there are workers, or shall be.
+    /// Kinds of which there are workers, or should be.
     pub(crate) kept: BTreeSet<String>,
-    /// Kinds of which there shall be workers and are none, as their programs crash again and again; with what their process manager says.
+    /// Kinds of which there should be workers but are none, because their programs crash repeatedly; with the process manager's reason.
     pub(crate) given_up: BTreeMap<String, String>,
-    /// Hosts whose process managers do not answer: what they can start is not known.
+    /// Hosts whose process managers do not answer: what they can start is unknown.
     pub(crate) unheard: BTreeSet<String>,
 }
 
-/// A worker with what it says of itself.
+/// A worker with its description.
 #[derive(Debug)]
 pub(crate) struct Described {
     pub(crate) id: String,
@@ -45,7 +45,7 @@ pub(crate) struct Described {
 }
 
 impl Offered {
-    /// What is there as far as it answers. What is not known so is seen when it is used.
+    /// What the system offers, as far as it answers. The rest is noticed when it is used.
     pub(crate) async fn known(tls: &ClientTls, resource_manager: &Endpoint) -> Offered {
         let channels = Channels::new(tls);
         let asked = tokio::time::timeout(PATIENCE_OF_ALL, Offered::ask(&channels, resource_manager));
@@ -76,7 +76,7 @@ impl Offered {
         for (host, answer) in hosts {
             match answer {
                 Ok(Ok(host)) => pools.extend(host.pools.into_iter().filter(|pool| pool.max > 0)),
-                // One that refuses to say is there, and will go on refusing.
+                // A process manager that refuses to answer exists, and will go on refusing.
                 Ok(Err(error)) if !error.is_crash() => {}
                 Ok(Err(_)) | Err(_) => drop(unheard.insert(host)),
             }
@@ -84,7 +84,7 @@ impl Offered {
         Ok(Offered { workers, kinds, unheard, ..Offered::of_pools(pools) })
     }
 
-    /// What there is by what process managers say of their pools.
+    /// What the pools of process managers offer.
     fn of_pools(pools: Vec<PoolStatus>) -> Offered {
         let mut offered = Offered::default();
         for pool in pools {
@@ -99,25 +99,25 @@ impl Offered {
         offered
     }
 
-    /// Who may still say what is not known: workers that are being started, and process managers that do not answer.
+    /// Sources of missing information that may still answer: workers that are being started, and process managers that do not answer.
     pub(crate) fn awaited(&self) -> Vec<String> {
         let workers = self.away().into_iter().map(|kind| format!("workers of {kind}"));
         workers.chain(self.unheard.iter().map(|host| format!("the process manager of {host}"))).collect()
     }
 
-    /// Kinds of which there are workers, or shall be, and none is offered: they are being started, perhaps once more.
+    /// Kinds of which there are workers, or should be, with none offered: they are being started, perhaps again.
     pub(crate) fn away(&self) -> Vec<&str> {
         let is_there = |kind: &str| self.workers.iter().any(|worker| worker.kind == kind);
         self.kept.iter().map(String::as_str).filter(|kind| !is_there(kind)).collect()
     }
 
-    /// Where workers and the catalogue say something else, and descriptions that are not believed, each in a sentence with whose it is.
+    /// Differences between workers and the catalogue, and rejected descriptions, each as a sentence with the worker's id.
     pub(crate) fn mismatches(&self, catalogue: &Catalogue) -> Vec<String> {
         let of = |worker: &Described| -> Vec<String> {
             match &worker.description {
                 Ok(said) => said.mismatches(catalogue, &worker.kind),
                 Err(refused @ DescribeError::Refused(_)) => vec![refused.to_string()],
-                // A worker need not describe itself.
+                // A worker need not have a description.
                 Err(DescribeError::Unanswered(_)) => Vec::new(),
             }
         };
@@ -127,7 +127,7 @@ impl Offered {
         self.workers.iter().flat_map(told).collect()
     }
 
-    /// Adds what workers say and the catalogue does not have.
+    /// Adds what workers describe and the catalogue does not have.
     pub(crate) fn extend(&self, catalogue: &mut Catalogue) {
         for Described { kind, description, .. } in &self.workers {
             if let Ok(said) = description {
@@ -136,7 +136,7 @@ impl Offered {
         }
     }
 
-    /// Which resources of a task nobody offers, and what to do: it would wait for them.
+    /// Resources of a task that nobody offers, and what to do: a run would wait for them.
     pub(crate) fn lacking(&self, program: &Program) -> Vec<String> {
         let asks = |operation| matches!(operation, ResourceOperation::Block | ResourceOperation::Consume);
         let all =
@@ -153,7 +153,7 @@ impl Offered {
                 lacking.entry(kind).or_insert(&state.path);
             }
         }
-        // A system that was not asked lacks nothing that is known.
+        // A system that did not answer counts as lacking nothing.
         if self.kinds.is_empty() {
             return Vec::new();
         }
@@ -200,7 +200,7 @@ mod tests {
         let there = Described {
             id: "planner-1@compute".to_owned(),
             kind: "PathPlanner".to_owned(),
-            // It is there, and has nothing to say.
+            // The worker exists, and has no description.
             description: Err(DescribeError::Unanswered(String::new())),
         };
         let kinds = |all: &[&str]| all.iter().map(|kind| (*kind).to_owned()).collect();

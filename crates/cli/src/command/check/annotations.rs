@@ -1,11 +1,11 @@
-//! `ratn check --annotations`: what is in force for each state, and who says so.
+//! `ratn check --annotations`: the annotations in force for each state, and their origin.
 
 use crate::failure::Failure;
 use crate::output;
 use ratn_model::in_force::{InForce, in_force};
 use ratn_model::program::{Origin, Program};
 
-/// Prints it, as a document where that is wanted.
+/// Prints them, as JSON where requested.
 pub(super) fn print(program: &Program, json: bool) -> Result<(), Failure> {
     let states = in_force(program);
     let text = match json {

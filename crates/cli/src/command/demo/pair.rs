@@ -1,5 +1,5 @@
-//! `ratn demo --robots 2`: two arms at one table, a task each. First one task after the other, then both at once, each way in a cell that is laid
-//! from the same seed.
+//! `ratn demo --robots 2`: two arms at one table, a task each. First one task after the other, then both at once, each time in a cell that is
+//! laid out from the same seed.
 
 use super::{BuiltIn, out_directory, said};
 use crate::arguments::{DemoArguments, GoodsArguments, SystemArguments};
@@ -29,14 +29,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
-/// The robot whose two arms do it.
+/// The robot with two arms.
 const TWIN: &str = "twin";
-/// Its arms, and what the task's parameter calls them.
+/// Its arms, by the names that the task's parameter uses.
 const ARMS: [&str; 2] = ["left", "right"];
-/// The task of either.
+/// The task of each arm.
 const FETCH: (&str, &str) = ("fetch_boxes_pair.yaml", include_str!("../../../../../examples/fetch_boxes_pair.yaml"));
 
-/// How the two tasks go.
+/// The order of the two tasks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Way {
     InTurn,
@@ -53,18 +53,18 @@ struct OneRun {
     chart: PathBuf,
 }
 
-/// Both tasks in one way.
+/// Both tasks in one order.
 #[derive(Debug)]
 struct Outcome {
     way: Way,
     runs: Vec<OneRun>,
-    /// From the begin of the first to the end of the last, in the robot's seconds.
+    /// From the beginning of the first run to the end of the last, in the robot's seconds.
     makespan_s: f64,
     delivered: usize,
     unintended_contacts: Vec<UnintendedContact>,
 }
 
-/// All that is shown.
+/// Everything that is shown.
 #[derive(Debug)]
 struct Demonstration {
     boxes: u32,
@@ -74,7 +74,7 @@ struct Demonstration {
     outcomes: Vec<Outcome>,
 }
 
-/// What both ways have in common.
+/// What both orders share.
 struct Setup<'a> {
     arguments: &'a DemoArguments,
     config: SystemConfig,
@@ -83,7 +83,7 @@ struct Setup<'a> {
     tls: &'a ClientTls,
 }
 
-/// Runs both tasks in both ways and compares.
+/// Runs both tasks in both orders and compares.
 pub(super) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Failure> {
     let config = config(arguments)?;
     let tls = &config.client_tls(tls)?;
@@ -92,13 +92,13 @@ pub(super) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Fail
     let setup = Setup { arguments, config, program, directory: &directory, tls };
     let DemoArguments { boxes, planners, speed, seed, .. } = *arguments;
     let mut demonstration = Demonstration { boxes, planners, speed, seed, outcomes: Vec::new() };
-    // What went wrong first; the other way is shown all the same.
+    // The first failure; the other order is run all the same.
     let mut failed: Option<String> = None;
     let outcome: Result<(), Failure> = blocking_here(async {
         let interrupt = Interrupt::listen()?;
         for way in [Way::InTurn, Way::Together] {
             output::progress(format_args!("\n{}", way.name()));
-            // A config is large.
+            // Boxed, because a config is large.
             let outcome = Box::pin(setup.perform(way, &interrupt)).await.with_context(|| way.name())?;
             if let Some(touched) = said(&outcome.unintended_contacts) {
                 output::progress(format_args!("{}: {touched}", way.name()));
@@ -127,7 +127,7 @@ pub(super) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Fail
     failed.map_or(Ok(()), |failed| Err(anyhow!(failed).into()))
 }
 
-/// The config of either system; what does not go with two robots is refused.
+/// The config of both systems; arguments that do not fit two robots are refused.
 fn config(arguments: &DemoArguments) -> Result<SystemConfig, Failure> {
     let refused = |why: String| Failure::Refused(format!("ratn: --robots 2: {why}"));
     if arguments.robot.as_deref().is_some_and(|robot| robot != TWIN) {
@@ -156,7 +156,7 @@ fn config(arguments: &DemoArguments) -> Result<SystemConfig, Failure> {
 }
 
 impl Setup<'_> {
-    /// Performs both tasks in a way, on a system of its own.
+    /// Performs both tasks in one order, on a separate system.
     async fn perform(&self, way: Way, interrupt: &Interrupt) -> anyhow::Result<Outcome> {
         let mut system = starting(Box::pin(System::start_private(self.config.clone(), self.tls)), interrupt).await?;
         let place = system.place();
@@ -168,7 +168,7 @@ impl Setup<'_> {
                     let left = Box::pin(left).await?;
                     (left, Box::pin(right).await?)
                 }
-                // Whatever becomes of one, the other goes on to its end.
+                // If one fails, the other still runs to its end.
                 Way::Together => {
                     let (left, right) = tokio::join!(Box::pin(left), Box::pin(right));
                     (left?, right?)
@@ -187,7 +187,7 @@ impl Setup<'_> {
         system.stop().await;
         let ((left, right), judgement) = judged?;
         let makespan_s = match way {
-            // What a client needs to begin the second run is not counted.
+            // The time that a client needs to begin the second run is not counted.
             Way::InTurn => left.ended.makespan_s + right.ended.makespan_s,
             Way::Together => passed_s,
         };
@@ -202,7 +202,7 @@ impl Setup<'_> {
         let log = file("jsonl");
         let run = Run {
             program: self.program.clone(),
-            // Its task file is built in.
+            // The task file is built in.
             from: None,
             file: String::new(),
             parameters: self.program.bind_parameters(&set)?,
@@ -212,7 +212,7 @@ impl Setup<'_> {
             log: log.clone(),
             breakpoints: Vec::new(),
             quiet: false,
-            // The system ends with the demo: nobody resumes it.
+            // The system ends with the demo, so nobody resumes the run.
             checkpoint_every: 0,
         };
         let ended = shell::run(run, place, interrupt).await.with_context(|| format!("the arm `{arm}`"))?;
@@ -238,7 +238,7 @@ impl Way {
 }
 
 impl Outcome {
-    /// What is not as it should be, if anything, by the cell's ground truth.
+    /// What is wrong with the result, if anything, according to the cell's ground truth.
     fn what_is_wrong(&self, boxes: u32) -> Option<String> {
         let failed = self.runs.iter().find(|run| run.ended.outcome != SUCCESS);
         if let Some(OneRun { arm, ended, .. }) = failed {
@@ -258,17 +258,17 @@ impl Demonstration {
         self.outcomes.iter().find(|outcome| outcome.way == way)
     }
 
-    /// The makespan of a way in which both tasks ended well.
+    /// The makespan, if both tasks ended with success.
     fn makespan_s(&self, way: Way) -> Option<f64> {
         self.of(way).filter(|outcome| outcome.is_good()).map(|outcome| outcome.makespan_s)
     }
 
-    /// How much shorter both together are, in percent.
+    /// How much shorter the makespan of both together is, in percent.
     fn saving(&self) -> Option<f64> {
         Some(improvement(self.makespan_s(Way::InTurn)?, self.makespan_s(Way::Together)?))
     }
 
-    /// One chart per run, all with the time axis of the longest.
+    /// Draws a chart per run, all with the time axis of the longest.
     fn draw(&self) -> anyhow::Result<()> {
         let runs = || self.outcomes.iter().flat_map(|outcome| &outcome.runs);
         let scale_s = runs().map(|run| run.timeline.end_s).fold(0.0, f64::max);
@@ -430,7 +430,7 @@ mod tests {
                 let said = [0.3 + 0.14 * i as f64, side * 0.58, 0.7];
                 assert!((0..3).all(|k| (said[k] - at[k]).abs() < 1e-9), "{said:?} {at:?}");
             }
-            // All of a box is in what the camera looks at.
+            // The whole box is in the region that the camera looks at.
             let far = boxes.greatest[0] / 2.0;
             for (x, y) in [(boxes.x[0] - far, boxes.y[0] - far), (boxes.x[1] + far, boxes.y[1] + far)] {
                 assert!((x - 0.47).abs() <= 0.19 && (y - side * 0.26).abs() <= 0.22, "({x}, {y})");

@@ -1,4 +1,4 @@
-//! What a demonstration has to show: the paper's Table I or II with this machine's figures, and where the time went.
+//! The results of a demonstration: the paper's Table I or II with this machine's figures, and where the time went.
 
 use crate::arguments::DemoArguments;
 use crate::command::tables::improvement;
@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use std::fmt;
 use std::path::PathBuf;
 
-/// Tables I and II of the paper: HSM, CDTN 1 MP, CDTN 2 MP.
+/// Tables I and II of the paper: HSM, CDTN 1 MP, CDTN 2 MP, in seconds.
 const PAPER: [(Goods, f64, Option<f64>, f64); 5] = [
     (Goods::Boxes(1), 81.3, Some(73.5), 72.3),
     (Goods::Boxes(2), 123.7, Some(107.3), 97.3),
@@ -22,35 +22,35 @@ const PAPER: [(Goods, f64, Option<f64>, f64); 5] = [
     (Goods::Dishes { bowls: 3, forks: 3, cups: 0, plates: 0 }, 255.4, None, 207.2),
 ];
 
-/// The row of the task whose motions and looks overlap.
+/// The row of the task with overlapping motions and looks.
 const OVERLAPPED: Work = Work::Overlapped { plan_s: 0.0 };
 
-/// What a task brings somewhere.
+/// The objects that a task moves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Goods {
     /// Boxes, onto the base.
     Boxes(u32),
     /// Boxes, from one side of a table to the other.
     OnTable(u32),
-    /// Tableware, onto a table that plates lie on.
+    /// Tableware, onto a table with plates.
     Dishes { bowls: u32, forks: u32, cups: u32, plates: u32 },
 }
 
-/// Which task is run, and how long its planners take. Each is a row of the table.
+/// Which task is run, and how long its planners may take. Each is a row of the table.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Work {
-    /// The paper's task; planners use the time that it gives them.
+    /// The paper's task; planners use the time budget that it gives them.
     Budget,
-    /// The paper's task; planners take as long as a path takes.
+    /// The paper's task; planners take only as long as a path needs.
     NoBudget,
-    /// The task whose motions and looks overlap.
+    /// The task with overlapping motions and looks.
     Overlapped {
-        /// How long a plan may get better, in the robot's seconds; 0 leaves it to the planner.
+        /// Time for which a plan may be improved, in the robot's seconds; 0 leaves it to the planner.
         plan_s: f64,
     },
 }
 
-/// One run to be made.
+/// A planned run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Plan {
     pub(super) mode: Mode,
@@ -58,16 +58,16 @@ pub(super) struct Plan {
     pub(super) work: Work,
 }
 
-/// One run that was made.
+/// A finished run.
 #[derive(Debug)]
 pub(super) struct Outcome {
     pub(super) plan: Plan,
     pub(super) timeline: Timeline,
-    /// What stands where it should in the cell's ground truth.
+    /// Number of objects at their places, according to the cell's ground truth.
     pub(super) delivered: usize,
-    /// How far a bowl or a cup leaned at the most while it was held.
+    /// Maximum tilt of a bowl or a cup while it was held, in radians.
     pub(super) greatest_tilt_rad: f64,
-    /// What touched that should not have, by the cell's physics.
+    /// Unintended contacts, according to the cell's physics.
     pub(super) unintended_contacts: Vec<UnintendedContact>,
     /// How the task ended, as a sentence.
     pub(super) end: String,
@@ -86,12 +86,12 @@ pub(super) struct Demonstration {
 }
 
 impl Work {
-    /// Whether it is of the same row.
+    /// Whether both belong to the same row.
     pub(super) fn is_like(self, other: Work) -> bool {
         std::mem::discriminant(&self) == std::mem::discriminant(&other)
     }
 
-    /// For people, behind the name of a mode.
+    /// Text for people after the name of a mode.
     fn suffix(self) -> String {
         match self {
             Work::Budget => String::new(),
@@ -101,7 +101,7 @@ impl Work {
         }
     }
 
-    /// What `--json` calls the budget of the planners.
+    /// The name of the planners' budget in `--json`.
     fn budget(self) -> &'static str {
         match self {
             Work::Budget => "task",
@@ -112,7 +112,7 @@ impl Work {
 }
 
 impl Plan {
-    /// For people.
+    /// Name for people.
     pub(super) fn name(&self) -> String {
         let planners = match self.mode {
             Mode::Hsm => String::new(),
@@ -121,7 +121,7 @@ impl Plan {
         format!("{}{planners}{}", mode_name(self.mode), self.work.suffix())
     }
 
-    /// For files.
+    /// Name for files.
     pub(super) fn file_stem(&self) -> String {
         let mode = match self.mode {
             Mode::Hsm => "hsm".to_owned(),
@@ -130,7 +130,7 @@ impl Plan {
         format!("{mode}{}", self.work.suffix().replace(", ", "-").replace(' ', "-"))
     }
 
-    /// Before it begins.
+    /// Text that is printed before the run begins.
     pub(super) fn announcement(&self, goods: &Goods) -> String {
         let how = match self.mode {
             Mode::Hsm => "as its state machine is written".to_owned(),
@@ -163,7 +163,7 @@ impl Demonstration {
         self.outcomes.iter().filter(move |outcome| outcome.plan.work.is_like(work))
     }
 
-    /// Of the quickest run that ended with success; how long another lasted says nothing.
+    /// The makespan of the fastest run that ended with success; other runs do not count.
     fn makespan_s(&self, mode: Mode, planners: u32, work: Work) -> Option<f64> {
         let fitting =
             self.of(work).filter(|o| o.plan.mode == mode && (mode == Mode::Hsm || o.plan.planners == planners));
@@ -183,7 +183,7 @@ impl Demonstration {
         self.outcomes.first().map_or(Work::Budget, |first| first.plan.work)
     }
 
-    /// For each time that plans of the state machine were given, how long the run lasted, where it ended with success.
+    /// For each planning time of the sequential runs, the makespan where the run ended with success.
     fn sweep(&self) -> Vec<(f64, Option<f64>)> {
         let hsm = self.outcomes.iter().filter(|o| o.plan.mode == Mode::Hsm);
         let overlapped = hsm.filter_map(|o| match o.plan.work {
@@ -193,8 +193,8 @@ impl Demonstration {
         overlapped.collect()
     }
 
-    /// The document of `--json`. The keys of the main runs, with the task's budget, are at the top; those of the runs without one are the
-    /// same, below `budget_none`, and those of the task that overlaps below `overlapped`.
+    /// The document of `--json`. The keys of the main runs, with the task's budget, are at the top; those of the runs without a budget
+    /// are the same, below `budget_none`, and those of the overlapped task below `overlapped`.
     pub(super) fn to_json(&self) -> Value {
         let main = self.main_work();
         let mut document = json!({
@@ -241,7 +241,7 @@ impl Demonstration {
             "cdtn_1mp_s": rounded(row.cdtn_1mp_s),
             "cdtn_2mp_s": rounded(row.cdtn_nmp_s),
             "improvement_2mp_percent": rounded(row.improvement()),
-            // What each of the runs delivered, at the least.
+            // The least that any of the runs delivered.
             "delivered": delivered.iter().min().copied().unwrap_or(0),
             "delivered_per_run": delivered,
             "unintended_contacts": outcomes.iter().map(|o| o.unintended_contacts.len()).sum::<usize>(),
@@ -265,7 +265,7 @@ pub(super) fn contact_json(contact: &UnintendedContact) -> Value {
 }
 
 impl Goods {
-    /// What the command line asks for.
+    /// The objects that the command line asks for.
     pub(super) fn of(arguments: &DemoArguments, onto_base: bool) -> Result<Goods, Failure> {
         match *arguments {
             DemoArguments { scenario: Setting::Boxes, boxes, .. } if !onto_base => Ok(Goods::OnTable(boxes)),
@@ -277,7 +277,7 @@ impl Goods {
         }
     }
 
-    /// How many.
+    /// Their number.
     pub(super) fn count(&self) -> usize {
         match *self {
             Goods::Boxes(boxes) | Goods::OnTable(boxes) => boxes as usize,
@@ -285,7 +285,7 @@ impl Goods {
         }
     }
 
-    /// As parameters of the task.
+    /// Parameters of the task.
     pub(super) fn parameters(&self) -> Vec<(String, String)> {
         let set = |name: &str, value: u32| (name.to_owned(), value.to_string());
         match *self {
@@ -296,7 +296,7 @@ impl Goods {
         }
     }
 
-    /// What was to be done with them.
+    /// What was to be done with them, for people.
     pub(super) fn destination(&self) -> &'static str {
         match self {
             Goods::Boxes(_) => "delivered to the base",

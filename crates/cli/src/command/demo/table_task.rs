@@ -1,14 +1,14 @@
-//! The task that fetches boxes on a table, with the numbers of a robot's own workplace in place of those that it is written with.
+//! The task that fetches boxes on a table, with the numbers of a robot's own workplace in place of the written ones.
 
 use anyhow::{Context, ensure};
 use ratn_motion::robot::Robot;
 use ratn_motion::workplace::{Surface, Workplace};
 use std::fmt::Write;
 
-/// The robot with whose workplace the task is written.
+/// The robot for whose workplace the task is written.
 const WRITTEN_FOR: &str = "panda";
 
-/// The workplace of a robot that can do the task, with so many boxes; or why it cannot.
+/// The workplace of a robot that can do the task with this number of boxes; or why it cannot.
 pub(super) fn workplace<'r>(robot: &'r Robot, observation: &str, boxes: u32) -> Result<&'r Workplace, String> {
     let own = "run your own task with `ratn run TASK --robot`";
     let workplace = robot.workplace().ok_or_else(|| {
@@ -30,7 +30,7 @@ pub(super) fn workplace<'r>(robot: &'r Robot, observation: &str, boxes: u32) -> 
     }
 }
 
-/// The task's text at another workplace than that which it is written with.
+/// The task's text for another workplace.
 pub(super) fn at(text: &str, workplace: &Workplace) -> anyhow::Result<String> {
     let written_for = Robot::built_in(WRITTEN_FOR).context("the robot that the task is written for")?;
     let written = written_for.workplace().context("the workplace that the task is written for")?;
@@ -42,7 +42,7 @@ pub(super) fn at(text: &str, workplace: &Workplace) -> anyhow::Result<String> {
     Ok(text)
 }
 
-/// What in the task follows from a workplace, as the task has it.
+/// The parts of the task's text that depend on a workplace.
 fn parts(workplace: &Workplace) -> [String; 6] {
     let Workplace { table, boxes, places, .. } = workplace;
     let top = number(table.top_m());
@@ -51,7 +51,7 @@ fn parts(workplace: &Workplace) -> [String; 6] {
         let (x, y, z, yaw) = (number(*x), number(*y), number(*z), places.yaw);
         let _ = writeln!(lines, "  - \"at(place_{}) = pose({x}, {y}, {z}, 0, 0, {yaw})\"", index + 1);
     }
-    // Around a box that stands at the edge, whichever way; and around one that lies as the places do.
+    // Margins for a box that stands at the edge in any orientation, and for a box that lies as the places do.
     let [longer, ..] = boxes.greatest;
     let (around, along) = (longer + 0.04, 2.0 * longer);
     let (cosine, sine) = (places.yaw.cos().abs(), places.yaw.sin().abs());
@@ -71,7 +71,7 @@ fn range(values: impl Iterator<Item = f64>) -> [f64; 2] {
     values.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| [low.min(value), high.max(value)])
 }
 
-/// What the camera looks at: a rectangle on the table, and so much around it.
+/// The region that the camera looks at: a rectangle on the table, and a margin around it.
 fn region([x, y]: [[f64; 2]; 2], around: [f64; 2], top: &str) -> String {
     let centre = [x, y].map(|[low, high]| number((low + high) / 2.0));
     let size = [(x, around[0]), (y, around[1])].map(|([low, high], around)| number(high - low + around));
@@ -82,9 +82,9 @@ fn numbers(values: &[f64]) -> String {
     values.iter().map(|value| number(*value)).collect::<Vec<_>>().join(", ")
 }
 
-/// To the tenth of a millimetre.
+/// Rounded to a tenth of a millimetre.
 fn number(value: f64) -> String {
-    // A zero has no sign.
+    // Adding 0 removes the sign of a zero.
     ((value * 1e4).round() / 1e4 + 0.0).to_string()
 }
 

@@ -1,4 +1,4 @@
-//! What this machine has: directories with room, limits of this user, groups of processes, memory.
+//! Checks of this machine: directories and disk space, limits of this user, cgroups, memory.
 
 use super::Findings;
 use crate::system::config::SystemConfig;
@@ -12,16 +12,17 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 const MIB: u64 = 1 << 20;
-/// With less room a state, a log or an event log is soon not written any more.
+/// With less free space a state, a log or an event log soon cannot be written any more.
 const LITTLE_ROOM: u64 = 100 * MIB;
 const SOME_ROOM: u64 = 1_024 * MIB;
-/// Files that a daemon has open besides those for its workers and clients.
+/// Open files of a daemon apart from those for its workers and clients.
 const OWN_FILES: u64 = 256;
-/// Files of a process manager for each worker: pipes, log, pidfd, connections.
+/// Open files of a process manager per worker: pipes, log, pidfd, connections.
 const FILES_PER_WORKER: u64 = 12;
-/// The longest name of a socket in a runtime directory, of a worker: `/` and 48 + 48 bytes and `-999@.notify`, shortened to what is usual.
+/// Assumed length of a worker's socket name in a runtime directory. The longest possible one is `/` and 48 + 48 bytes and `-999@.notify`;
+/// this is a usual one.
 const SOCKET_NAME_BYTES: usize = 24;
-/// A socket's path has to fit into `sockaddr_un`, with its final zero.
+/// Maximum length of a socket path: it has to fit into `sockaddr_un`, with its final zero.
 const MAX_SOCKET_PATH_BYTES: usize = 107;
 
 pub(super) fn check(findings: &mut Findings, config: &SystemConfig, directory: &Path) {
@@ -77,7 +78,7 @@ fn runtime_directory(findings: &mut Findings, directory: &Path) {
     }
 }
 
-/// The directory, or the one that it would be made in.
+/// The directory, or its nearest existing ancestor.
 fn nearest(directory: &Path) -> Option<PathBuf> {
     directory.ancestors().find(|place| place.is_dir()).map(Path::to_owned)
 }
@@ -109,7 +110,7 @@ fn room(findings: &mut Findings, what: &str, directory: &Path) {
 
 fn files(findings: &mut Findings, workers: u64) {
     let needed = OWN_FILES + FILES_PER_WORKER * workers;
-    // A process manager takes all that it may have.
+    // A process manager raises its limit to the hard limit.
     let Ok((_, hard)) = getrlimit(Resource::RLIMIT_NOFILE) else { return };
     let found = format!("{hard} may be open at once; a process manager of {workers} workers needs some {needed}");
     if hard < needed {

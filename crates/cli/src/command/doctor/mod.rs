@@ -1,7 +1,7 @@
-//! `ratn doctor`: what is missing on this machine or in this config, and what to do about it.
+//! `ratn doctor`: reports what is missing on this machine or in this config, and what to do about it.
 //!
-//! Every check says what it found: `ok`, a `warning` (it works, until it does not), or a `problem` (it does not). Nothing is changed; a
-//! port is bound for a moment. Checks of one kind are in one file: `machine` (directories, room, limits, groups), `files` (TLS),
+//! Every check reports `ok`, a `warning` (it works for now) or a `problem` (it does not work). Nothing is changed; a port is bound for
+//! a moment. Each file has the checks of one kind: `machine` (directories, disk space, limits, cgroups), `tls` (TLS files),
 //! `templates`, `system` (daemons, hosts, clocks, pools).
 
 mod machine;
@@ -35,7 +35,7 @@ pub(crate) struct DoctorArguments {
     json: bool,
 }
 
-/// How bad it is.
+/// Severity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 enum Level {
@@ -44,18 +44,18 @@ enum Level {
     Problem,
 }
 
-/// What a check found.
+/// The result of a check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 struct Finding {
     level: Level,
-    /// What it is about: `[service.tls] key`, `template path-planner`, `host compute`.
+    /// The subject: `[service.tls] key`, `template path-planner`, `host compute`.
     about: String,
     found: String,
-    /// What to do; empty where nothing is to be done.
+    /// What to do; empty where there is nothing to do.
     help: String,
 }
 
-/// What checks have found so far.
+/// The results of the checks so far.
 #[derive(Debug, Default)]
 struct Findings(Vec<Finding>);
 
@@ -77,7 +77,7 @@ impl Findings {
     }
 }
 
-/// Examines this machine. Fails where there is a problem; warnings are none.
+/// Examines this machine. Fails where there is a problem; warnings are no failure.
 pub(super) fn run(arguments: &DoctorArguments, client_tls: &ClientTls) -> Result<(), Failure> {
     let directory = directory_of(arguments.runtime_dir.as_deref());
     let mut findings = Findings::default();
@@ -95,7 +95,7 @@ pub(super) fn run(arguments: &DoctorArguments, client_tls: &ClientTls) -> Result
             SystemConfig::load(None)?
         }
     };
-    // Files that cannot be read are told of as the certificates are looked at.
+    // Files that cannot be read are reported by the check of the certificates.
     let client_tls = &config.service.client_tls(client_tls).unwrap_or_else(|_| client_tls.clone());
     machine::check(&mut findings, &config, &directory);
     tls::check(&mut findings, &config);
@@ -111,7 +111,7 @@ pub(super) fn run(arguments: &DoctorArguments, client_tls: &ClientTls) -> Result
     conclude(arguments, findings)
 }
 
-/// Shows what was found.
+/// Prints the results.
 fn conclude(arguments: &DoctorArguments, mut findings: Findings) -> Result<(), Failure> {
     let count = |level| findings.0.iter().filter(|finding| finding.level == level).count();
     let (problems, warnings) = (count(Level::Problem), count(Level::Warning));

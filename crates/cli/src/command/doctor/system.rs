@@ -1,5 +1,5 @@
-//! The running system: who answers, whose clock is off, which host is drained, which pool has failed; where nothing runs, whether its
-//! ports are free.
+//! The running system: which roles answer, which clocks are off, which hosts are drained, which pools have failed; where nothing
+//! runs, whether the ports are free.
 
 use super::Findings;
 use super::tls::listens;
@@ -20,14 +20,14 @@ use std::path::Path;
 use std::time::Duration;
 use time::OffsetDateTime;
 
-/// Who has not answered by then does not.
+/// Timeout of an answer.
 const PATIENCE: Duration = Duration::from_secs(2);
-/// Clocks that are further apart make charts and logs of several hosts hard to read …
+/// Clocks that are further apart than this make charts and logs of several hosts hard to read …
 const SLIGHT_OFFSET_MS: i64 = 20;
 /// … and certificates and deadlines doubtful.
 const LARGE_OFFSET_MS: i64 = 5_000;
 
-/// Those that may stand by for one another.
+/// Roles that can have standbys.
 const ROLES: [&str; 2] = [resource_manager::ROLE, world_pool::ROLE];
 
 pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, tls: &ClientTls, directory: &Path) {
@@ -41,7 +41,7 @@ pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, tls: &
     for (role, listen) in listens(config) {
         let leads = leaders.get(role);
         match directory.find(role) {
-            // One that led and was killed has left its endpoint.
+            // A leader that was killed has left its endpoint file.
             Ok(endpoint)
                 if leads.is_some_and(|leads| leads.as_ref().is_some_and(|leads| *leads != endpoint.to_string()))
                     && stands_by(findings, role, tls, &endpoint).await => {}
@@ -51,7 +51,7 @@ pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, tls: &
                     manager = Some(endpoint);
                 }
             }
-            // Who stands by publishes no endpoint.
+            // A standby publishes no endpoint.
             Err(FindError::NotPublished { .. }) if leads.is_some() && stands_by(findings, role, tls, &listen).await => {
             }
             Err(FindError::NotPublished { .. }) => free_port(findings, role, &listen),
@@ -64,7 +64,7 @@ pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, tls: &
     }
 }
 
-/// Who leads where several stand by for one another: its address.
+/// The address of the leader where several stand by for one another.
 async fn leader(findings: &mut Findings, role: &'static str, storage: StorageConfig) -> Option<String> {
     let place = storage.prefix.clone();
     let about = format!("{role}, leader");
@@ -84,7 +84,7 @@ async fn leader(findings: &mut Findings, role: &'static str, storage: StorageCon
     None
 }
 
-/// Whether somebody answers there who does not lead: says so.
+/// Whether a standby answers there; reports it.
 async fn stands_by(findings: &mut Findings, role: &str, tls: &ClientTls, listen: &Endpoint) -> bool {
     let stands_by = Health::of(listen.clone(), tls).is_serving(PATIENCE).await == Ok(false);
     if stands_by {
@@ -100,7 +100,7 @@ async fn role_answers(findings: &mut Findings, role: &str, tls: &ClientTls, endp
             true
         }
         Err(error) => {
-            // The last thing that it said.
+            // The last status that it reported.
             let (found, help) = if error.to_string().contains(NOT_SERVING) {
                 let help = "a standby is so, too; else its log says why; where its disk is full or failed, see to that and start it again";
                 (
@@ -119,7 +119,7 @@ async fn role_answers(findings: &mut Findings, role: &str, tls: &ClientTls, endp
     }
 }
 
-/// Where a role would listen that does not run.
+/// Checks the address at which a role would listen that does not run.
 fn free_port(findings: &mut Findings, role: &str, listen: &Endpoint) {
     let (Endpoint::Tcp { host, port } | Endpoint::Tls { host, port }) = listen else {
         return findings.ok(role, "does not run in this runtime directory");
@@ -188,7 +188,7 @@ async fn process_manager(findings: &mut Findings, channels: &Channels, host: &Re
     workers(findings, &about, &pools);
 }
 
-/// Its clock was read between question and answer; half of that is how well it is known (Cristian 1989).
+/// The remote clock was read between question and answer; half of that time is the uncertainty (Cristian 1989).
 fn clock(findings: &mut Findings, about: &str, asked: OffsetDateTime, answered: OffsetDateTime, clock_us: u64) {
     let micros = |at: OffsetDateTime| i64::try_from(at.unix_timestamp_nanos() / 1_000).unwrap_or(i64::MAX);
     let middle = (micros(asked) + micros(answered)) / 2;

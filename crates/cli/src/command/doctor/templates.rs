@@ -1,4 +1,4 @@
-//! Templates: what they would start is there and may be started.
+//! Templates: whether their programs exist and may be started.
 
 use super::Findings;
 use ratn_daemon::process_manager::ProcessManagerConfig;

@@ -1,4 +1,5 @@
-//! The files of TLS: readable, their owner's alone, of one authority, not over, and for the names that are listened on.
+//! The TLS files: readable, private to their owner, of one authority, not expired, and valid for the names of the
+//! listen addresses.
 
 use super::Findings;
 use crate::system::config::SystemConfig;
@@ -14,7 +15,7 @@ use std::time::Duration;
 use time::OffsetDateTime;
 use webpki::{ALL_VERIFICATION_ALGS, EndEntityCert, KeyUsage, anchor_from_trusted_cert};
 
-/// From so long before its end on a certificate is warned of.
+/// A certificate that expires within this time causes a warning.
 const SOON: Duration = Duration::from_secs(30 * 86_400);
 const HOW_TO_RENEW: &str = "`ratn certs DIR HOST --renew` makes a new one; daemons read it when they start";
 
@@ -49,7 +50,7 @@ pub(super) fn check(findings: &mut Findings, config: &SystemConfig) {
     }
 }
 
-/// Where this config's roles listen.
+/// The listen addresses of this config's roles.
 pub(super) fn listens(config: &SystemConfig) -> [(&'static str, Endpoint); 4] {
     [
         ("resource-manager", config.resource_manager.listen.clone()),
@@ -68,7 +69,7 @@ fn is_reached(endpoint: &Endpoint) -> bool {
     }
 }
 
-/// The names of this machine among those that are listened on: others are other hosts'.
+/// The names of this machine among the listen addresses: the others belong to other hosts.
 fn names(listens: &[(&'static str, Endpoint)]) -> Vec<String> {
     let host = |endpoint: &Endpoint| match endpoint {
         Endpoint::Tcp { host, port } | Endpoint::Tls { host, port } => Some((host.clone(), *port)),
@@ -170,6 +171,6 @@ fn private_key(findings: &mut Findings, about: &str, file: &Path) -> Option<KeyP
         let found = format!("others may read it (mode {:o})", there.mode() & 0o777);
         findings.problem(at, found, format!("chmod 600 {}", file.display()));
     }
-    // A kind of key that is not known here may serve all the same.
+    // A kind of key that is unknown here may still work.
     KeyPair::from_pem(&text).ok()
 }

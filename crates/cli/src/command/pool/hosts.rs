@@ -1,6 +1,6 @@
-//! Which process managers there are, over all hosts, and asking them.
+//! Finds the process managers of all hosts, and asks them.
 //!
-//! Each offers its host to the resource manager, with the address of the process manager as its endpoint: who finds the resource
+//! Each offers its host to the resource manager, with the process manager's address as its endpoint: whoever finds the resource
 //! manager finds every host. Without one, the process manager of this host is found by its endpoint file.
 
 use super::HostArguments;
@@ -14,7 +14,7 @@ use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::tls::ClientTls;
 use std::time::Duration;
 
-/// A host that has not answered by then does not count.
+/// Timeout of an answer.
 const PATIENCE: Duration = Duration::from_secs(3);
 
 /// A process manager.
@@ -25,13 +25,13 @@ pub(super) struct Host {
     pub(super) client: ProcessClient,
 }
 
-/// A host with what it answered.
+/// A host with its answer.
 pub(super) struct Answered {
     pub(super) host: Host,
     pub(super) pools: Result<HostPools, String>,
 }
 
-/// All process managers that can be found, in the order of their hosts' names.
+/// All process managers that can be found, sorted by host name.
 pub(super) async fn find(arguments: &HostArguments, tls: &ClientTls) -> Result<Vec<Host>, Failure> {
     let channels = Channels::new(tls);
     let host = |name: &str, endpoint: Endpoint| -> Result<Host, Failure> {
@@ -54,7 +54,7 @@ pub(super) async fn find(arguments: &HostArguments, tls: &ClientTls) -> Result<V
     };
     let mut hosts = known.into_iter().map(|(name, at)| host(&name, at)).collect::<Result<Vec<_>, _>>()?;
     match own {
-        // It may not have come as far as the resource manager.
+        // The process manager of this host may not have reached the resource manager.
         Ok(own) if hosts.iter().all(|host| host.endpoint != own) => hosts.push(host("", own)?),
         Err(error) if hosts.is_empty() => return Err(Failure::Refused(format!("ratn: {error}"))),
         _ => {}
@@ -62,7 +62,7 @@ pub(super) async fn find(arguments: &HostArguments, tls: &ClientTls) -> Result<V
     Ok(hosts)
 }
 
-/// Where the resource manager is that knows the hosts.
+/// The address of the resource manager that knows the hosts.
 pub(super) fn resource_manager(arguments: &HostArguments) -> Option<Endpoint> {
     if arguments.manager.is_some() {
         return None;
@@ -77,7 +77,7 @@ async fn registered(channels: &Channels, manager: &Endpoint) -> Result<Vec<(Stri
     Ok(hosts.iter().filter_map(|host| Some((host.host.clone(), endpoint(host.endpoint())?))).collect())
 }
 
-/// What all of them answer, at the same time.
+/// Asks all of them at the same time.
 pub(super) async fn ask_all(hosts: Vec<Host>) -> Vec<Answered> {
     let asked = hosts.into_iter().map(async |host| {
         let pools = match tokio::time::timeout(PATIENCE, host.client.pools()).await {
@@ -91,7 +91,7 @@ pub(super) async fn ask_all(hosts: Vec<Host>) -> Vec<Answered> {
     answered
 }
 
-/// The one that `wanted` is about; refused where it is none or several. `--host` chooses.
+/// The host for which `wanted` holds; refused where there is none or several. `--host` chooses.
 pub(super) async fn the_one(
     arguments: &HostArguments,
     tls: &ClientTls,
@@ -119,12 +119,13 @@ pub(super) async fn the_one(
 }
 
 impl Answered {
-    /// The host's name as it says itself, else as the resource manager does, else its address is shown by others.
+    /// The host's own name for itself, else the resource manager's; without both it is empty, and the address is shown
+    /// elsewhere.
     pub(super) fn name(&self) -> &str {
         self.pools.as_ref().map_or(&self.host.name, |pools| &pools.host)
     }
 
-    /// Why it has no answer.
+    /// Why there is no answer.
     pub(super) fn problem(&self) -> Option<String> {
         let error = self.pools.as_ref().err()?;
         let name = if self.host.name.is_empty() { "this host" } else { &self.host.name };

@@ -1,4 +1,4 @@
-//! `ratn logs`: what a worker writes, on whichever host it is; of a template what all its workers write, each line with whose it is.
+//! `ratn logs`: the output of a worker on any host; for a template the output of all its workers, each line with its worker's id.
 //!
 //! Where no process manager answers, the files of this host are read: the logs of workers, and of the roles that `ratn up` started.
 
@@ -19,11 +19,11 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
-/// How often a log that is followed is looked at, and whether a template has new workers.
+/// Interval at which a followed log is read, and a template is checked for new workers.
 const LOOK_INTERVAL: Duration = Duration::from_millis(200);
-/// Pieces of several logs that wait to be written.
+/// Capacity for pieces of several logs that wait to be written.
 const PIECES: usize = 64;
-/// A line that is longer is written in parts.
+/// A longer line is written in parts.
 const MAX_LINE_BYTES: usize = 65_536;
 
 /// Prints the log of a worker, or of all workers of a template.
@@ -69,7 +69,7 @@ async fn of_worker(mut pieces: ratn_worker::client::LogPieces) -> Result<(), Fai
     Ok(())
 }
 
-/// Those there are, and with `follow` those that come.
+/// Prints the logs of existing workers, and with `follow` those of later ones.
 async fn of_template(clients: Vec<ProcessClient>, template: &str, follow: bool) -> Result<(), Failure> {
     let (lines, mut received) = mpsc::channel(PIECES);
     let mut reading = JoinSet::new();
@@ -99,7 +99,7 @@ async fn read_template(
     loop {
         let pools = client.pools().await?.pools;
         let workers = pools.into_iter().filter(|pool| pool.template == template).flat_map(|pool| pool.workers);
-        // One without a process has no log yet.
+        // A worker without a process has no log yet.
         for worker in workers.filter(|worker| worker.pid != 0 && known.insert(worker.id.clone())) {
             let (client, lines) = (client.clone(), lines.clone());
             reading.spawn(async move { read_worker(&client, &worker.id, follow, &lines).await });
@@ -117,7 +117,7 @@ async fn read_template(
     }
 }
 
-/// Line by line, each with the worker's id.
+/// Reads line by line, each with the worker's id.
 async fn read_worker(
     client: &ProcessClient,
     id: &str,
@@ -154,7 +154,7 @@ fn named_lines(id: &str, text: &[u8]) -> Vec<u8> {
     named
 }
 
-/// From the files of this host; nothing where there is none.
+/// Prints from the files of this host; `None` where there is no log.
 fn local(arguments: &LogsArguments) -> anyhow::Result<Option<()>> {
     let directory = RuntimeDirectory::at(directory_of(arguments.host.runtime_dir.as_deref()));
     let name = arguments.name.as_str();
@@ -180,7 +180,7 @@ fn print_file(file: PathBuf, follow: bool) -> anyhow::Result<()> {
     }
 }
 
-/// False once nobody reads it any more.
+/// Writes bytes; returns false once nobody reads them any more.
 fn written(bytes: &[u8]) -> anyhow::Result<bool> {
     let mut out = io::stdout().lock();
     match out.write_all(bytes).and_then(|()| out.flush()) {

@@ -125,7 +125,7 @@ pub(crate) struct DrainArguments {
     host: HostArguments,
 }
 
-/// Shows the workers of all hosts, once or again and again; fails where one does not answer.
+/// Shows the workers of all hosts, once or repeatedly; fails where a host does not answer.
 pub(super) fn ps(arguments: &PsArguments, tls: &ClientTls) -> Result<(), Failure> {
     let PsArguments { host, watch } = arguments;
     asking(async {
@@ -140,7 +140,7 @@ pub(super) fn ps(arguments: &PsArguments, tls: &ClientTls) -> Result<(), Failure
     })
 }
 
-/// The workers of all hosts as text, or JSON, and which hosts do not answer.
+/// The workers of all hosts as text or JSON, and the hosts that do not answer.
 async fn workers(arguments: &HostArguments, tls: &ClientTls) -> Result<(String, Vec<String>), Failure> {
     let managers = match hosts::resource_manager(arguments) {
         Some(endpoint) => leader::ask(&endpoint, tls).await,
@@ -172,7 +172,7 @@ async fn workers(arguments: &HostArguments, tls: &ClientTls) -> Result<(String, 
     Ok((lines.collect::<Vec<_>>().join("\n"), problems))
 }
 
-/// The workers of all hosts, and what each host uses, for whoever shows them beside other things.
+/// The workers of all hosts, and the resource usage of each host, for display together with other things.
 pub(super) async fn overview(runtime_dir: Option<PathBuf>, tls: &ClientTls) -> Result<String, Failure> {
     let arguments = HostArguments { runtime_dir, resource_manager: None, manager: None, host: None, json: false };
     let answered = hosts::ask_all(hosts::find(&arguments, tls).await?).await;
@@ -181,7 +181,8 @@ pub(super) async fn overview(runtime_dir: Option<PathBuf>, tls: &ClientTls) -> R
     Ok([show::hosts(&pools), show::table(&pools)].into_iter().chain(silent).collect::<Vec<_>>().join("\n"))
 }
 
-/// Where workers say something else than the catalogue of the system in the runtime directory; nothing where none is known.
+/// Differences between workers' descriptions and the catalogue of the system in the runtime directory; empty where none is
+/// known.
 async fn mismatches(arguments: &HostArguments, tls: &ClientTls) -> Vec<String> {
     let elsewhere = arguments.manager.is_some() || arguments.resource_manager.is_some();
     let Some(directory) = public_directory(arguments.runtime_dir.as_deref()).ok().filter(|_| !elsewhere) else {
@@ -193,19 +194,20 @@ async fn mismatches(arguments: &HostArguments, tls: &ClientTls) -> Vec<String> {
     }
 }
 
-/// More of workers that are otherwise than the catalogue says are told of, as far as those of the template that are ready say.
+/// Warns before more workers are started whose description differs from the catalogue, as far as the template's ready workers
+/// show.
 async fn warn_of_mismatches(arguments: &HostArguments, tls: &ClientTls, template: &str) {
     let is_of_it = |what: &&String| what.strip_prefix(template).is_some_and(|rest| rest.starts_with('-'));
     let mismatches = mismatches(arguments, tls).await;
     mismatches.iter().filter(is_of_it).for_each(|what| output::progress(format_args!("warning: {what}")));
 }
 
-/// Prints what workers wrote.
+/// Prints the output of workers.
 pub(super) fn logs(arguments: &LogsArguments, tls: &ClientTls) -> Result<(), Failure> {
     asking(logs::print(arguments, tls))
 }
 
-/// Starts and ends workers, and changes how many there are.
+/// Starts and ends workers, and changes their number.
 pub(super) fn run(arguments: &PoolArguments, tls: &ClientTls) -> Result<(), Failure> {
     let host = &arguments.host;
     asking(async {
@@ -258,7 +260,7 @@ pub(super) fn restart(arguments: &RestartArguments, tls: &ClientTls) -> Result<(
     })
 }
 
-/// Lets a host take no new work, or take it again.
+/// Drains a host, or ends the drain.
 pub(super) fn drain(arguments: &DrainArguments, tls: &ClientTls) -> Result<(), Failure> {
     let (name, host) = (arguments.name.as_str(), &arguments.host);
     asking(async {

@@ -5,8 +5,8 @@ use crate::columns::columns;
 use ratn_proto::types::{HostPools, PoolStatus, TrackingMode, WorkerState, WorkerStatus};
 use serde_json::{Value, json};
 
-/// A line for each worker; then for each host how it tracks processes and whether it is drained, and each pool of which there is something
-/// to say.
+/// A line for each worker; then for each host its tracking mode and whether it is drained, and a line for each pool with something to
+/// report.
 pub(super) fn table(hosts: &[&HostPools]) -> String {
     let pools = || hosts.iter().flat_map(|host| host.pools.iter().map(move |pool| (*host, pool)));
     let rows = pools().flat_map(|(_, pool)| pool.workers.iter().map(|worker| row(pool, worker)));
@@ -36,7 +36,7 @@ pub(super) fn table(hosts: &[&HostPools]) -> String {
     lines.join("\n")
 }
 
-/// A line for each host: its workers, and what they take of it.
+/// A line for each host: its workers, and their resource usage.
 pub(super) fn hosts(hosts: &[&HostPools]) -> String {
     let row = |host: &&HostPools| {
         let workers = || host.pools.iter().flat_map(|pool| &pool.workers);
@@ -65,7 +65,7 @@ fn tracking(mode: Option<TrackingMode>) -> &'static str {
     }
 }
 
-/// What is not found of a worker that clears the environment of a process and gives it a session of its own.
+/// What the tracking mode misses: processes of a worker that clear their environment and have a session of their own.
 fn tracking_limit(mode: Option<TrackingMode>) -> Option<&'static str> {
     match mode {
         Some(TrackingMode::Cgroup) | None => None,
@@ -108,7 +108,7 @@ fn age(seconds: u64) -> String {
     }
 }
 
-/// Hosts that do not answer say why.
+/// Hosts that do not answer have the reason.
 pub(super) fn in_json(hosts: &[Answered]) -> Value {
     let host = |one: &Answered| match &one.pools {
         Ok(pools) => json!({

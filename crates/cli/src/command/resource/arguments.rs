@@ -185,7 +185,7 @@ pub(super) fn attributes(given: &[(String, Value)]) -> Result<BTreeMap<String, V
     Ok(attributes)
 }
 
-/// A number or a truth value where it reads as one, else text.
+/// Parsed as a number or a truth value where possible, else a text.
 fn attribute(text: &str) -> Result<(String, Value), String> {
     let (name, value) = text.split_once('=').ok_or("expected NAME=VALUE")?;
     let value = match value {

@@ -1,8 +1,8 @@
-//! `block` and `consume`: what they take is held by a session of their own, which ends with the command however that ends.
+//! `block` and `consume`: the resources are held by a separate session, which ends with the command, in whatever way it ends.
 //!
-//! A program that is run with it is ended before another can have what it holds: when the manager is not heard, in the time that the
-//! session lives on there. A lease that somebody else ends is over at once, unless the resource has a `standstill_ms`, which then is
-//! to be more than [`STOP_MARGIN`].
+//! A program that is run meanwhile is ended before another client can get the resources: when the manager is not reachable, within
+//! the time that the session still lives there. A lease that somebody else ends is over at once, unless the resource has a
+//! `standstill_ms`, which then has to be more than [`STOP_MARGIN`].
 
 use super::arguments::HoldArguments;
 use super::{Asking, loss, show};
@@ -20,20 +20,20 @@ use std::os::unix::process::ExitStatusExt;
 use std::time::{Duration, Instant};
 use tokio::process::{Child, Command};
 
-/// The session of a program that holds something lives so long without a word of the manager: it goes on over short pauses, and can
-/// be ended in the rest of the time.
+/// Time to live of a session for a program: long enough to outlast short interruptions of the manager, and to end the program in the
+/// remaining time.
 const PROGRAM_TTL: Duration = Duration::from_secs(10);
-/// From SIGTERM to SIGKILL.
+/// Time from SIGTERM to SIGKILL.
 const STOP_PATIENCE: Duration = Duration::from_secs(2);
-/// So long before the session may be over a program is asked to end: its end, by SIGKILL where it has to be, comes before another can
-/// have what it holds.
+/// How long before the session may expire a program is asked to end: its end, by SIGKILL if necessary, comes before another client
+/// can get the resources.
 const STOP_MARGIN: Duration = Duration::from_secs(3);
-/// From a manager that does not answer to the next question.
+/// Pause before a manager that does not answer is asked again.
 const AGAIN: Duration = Duration::from_millis(250);
 const LEASE_VARIABLE: &str = "RATN_LEASE";
 const TOKEN_VARIABLE: &str = "RATN_TOKEN";
 
-/// `ratn resource block`
+/// `ratn resource block`.
 pub(super) async fn block(asking: &Asking, held: &HoldArguments) -> Result<(), Failure> {
     let requirement = held.selector.requirement(ResourceOperation::Block)?;
     let interrupt = Interrupt::listen()?;
@@ -67,8 +67,8 @@ pub(super) async fn block(asking: &Asking, held: &HoldArguments) -> Result<(), F
     outcome
 }
 
-/// Asks until there is an answer or the time is over: a manager that restarts keeps who holds, not who waits, and the request id
-/// makes one request of all.
+/// Asks until there is an answer or the time is over: a manager that restarts keeps holders, but not waiters, and the request id
+/// makes all attempts one request.
 async fn granted(
     session: &Session,
     client: &ResourceClient,
@@ -84,7 +84,7 @@ async fn granted(
             Ok(lease) => return Ok(lease),
             Err(error) => error,
         };
-        // A manager that came back without its memory knows the session again after the next ping.
+        // A manager that came back without its state learns of the session at the next ping.
         let forgotten = broke && error.code() == Some(tonic::Code::FailedPrecondition);
         if !(error.is_crash() || forgotten) || until.saturating_duration_since(Instant::now()) < AGAIN {
             return Err(error);
@@ -97,7 +97,7 @@ async fn granted(
     }
 }
 
-/// `ratn resource consume`
+/// `ratn resource consume`.
 pub(super) async fn consume(asking: &Asking, held: &HoldArguments) -> Result<(), Failure> {
     let requirement = held.selector.requirement(ResourceOperation::Consume)?;
     let interrupt = Interrupt::listen()?;
@@ -120,7 +120,7 @@ fn ttl_for(held: &HoldArguments) -> Duration {
     if held.program.is_empty() { super::SESSION_TTL } else { PROGRAM_TTL }
 }
 
-/// The program has ended: what still waits for that, and has no provider to say so, is free now.
+/// The program has ended: confirms the standstill of resources that still wait for it and have no provider to confirm it.
 async fn confirm_standstill(client: &ResourceClient, lease: &Lease) {
     for held in &lease.resources {
         let confirming = async {
@@ -132,13 +132,13 @@ async fn confirm_standstill(client: &ResourceClient, lease: &Lease) {
                 Ok(false)
             }
         };
-        // A manager that does not answer frees it after its bound.
+        // If the manager does not answer, the resource is free after its bound.
         let _ = tokio::time::timeout(AGAIN, confirming).await;
     }
 }
 
-/// Until the time, the user, the program, the resource manager or an operator ends it; `lost` says what the last did. No program is
-/// left then.
+/// Holds until the time is over, or the user, the program, the resource manager or an operator ends it; `lost` resolves with the
+/// reason if the lease ends. The program has ended when this returns.
 async fn hold(
     session: &Session,
     interrupt: &Interrupt,
@@ -152,7 +152,8 @@ async fn hold(
             let mut command = Command::new(program);
             command.args(arguments).kill_on_drop(true);
             command.envs(environment.iter().map(|(name, value)| (name, value)));
-            // A group of its own, so that what it starts ends with it; at a terminal it stays in the one that the keys are for.
+            // A separate process group, so that the processes that the program starts end with it; at a terminal it stays in the
+            // group that receives the keys.
             if !std::io::stdin().is_terminal() {
                 command.process_group(0);
             }
@@ -174,7 +175,7 @@ async fn hold(
     let outcome = tokio::select! {
         status = ended => match status.context("cannot wait for the program")? {
             status if status.success() => Ok(()),
-            // As shells have it, for one that a signal ended.
+            // The exit code of a program ended by a signal, as in shells.
             status => {
                 let code = status.code().or_else(|| status.signal().map(|signal| 128 + signal)).unwrap_or(1);
                 Err(Failure::Program(u8::try_from(code).unwrap_or(1)))
@@ -194,7 +195,7 @@ async fn hold(
     outcome
 }
 
-/// Resolves when the session may be over; where a program has to be ended first, that much earlier. What that means.
+/// Resolves when the session may expire, or earlier where a program has to be ended first. Returns a message about it.
 async fn unheard(session: &Session, held: &HoldArguments) -> String {
     if held.program.is_empty() {
         session.lost().await;
@@ -206,12 +207,12 @@ async fn unheard(session: &Session, held: &HoldArguments) -> String {
     format!("the resource manager was not heard for {seconds} s, others may have the resources in {left} s")
 }
 
-/// Asks a program that still runs to end, and ends it when it does not.
+/// Asks a running program to end, and kills it when it does not.
 async fn stop(child: &mut Child) {
     let Some(pid) = child.id().and_then(|pid| i32::try_from(pid).ok()).map(Pid::from_raw) else { return };
     let leads = nix::unistd::getpgid(Some(pid)) == Ok(pid);
     let signal = |signal| {
-        // Nobody is left to hear it otherwise.
+        // An error means that no process is left.
         let _ = if leads { nix::sys::signal::killpg(pid, signal) } else { nix::sys::signal::kill(pid, signal) };
     };
     signal(Signal::SIGTERM);
@@ -219,7 +220,7 @@ async fn stop(child: &mut Child) {
     if overdue {
         output::progress("the program did not end in time and is killed");
     }
-    // Also what the program has left in its group; the number of a process that has ended may be another's.
+    // This also reaches what the program has left in its group; without a group the id of an ended process may be reused.
     if overdue || leads {
         signal(Signal::SIGKILL);
     }

@@ -1,16 +1,17 @@
-//! How a holder hears that a lease has ended: an operator's `release` or `delete` is in the watch of what is held.
+//! How a holder learns that a lease has ended: the watch of its resources shows an operator's `release` or `delete`.
 //!
-//! The snapshot that a watch begins with is compared as its events are, so a watch that broke is begun again and misses nothing.
+//! The snapshot at the beginning of a watch is checked like its events, so a broken watch is opened again without missing
+//! anything.
 
 use ratn_model::resource::Lease;
 use ratn_proto::types::{Resource, ResourceEventKind, ResourceUpdate};
 use ratn_worker::client::ResourceClient;
 use std::time::Duration;
 
-/// From a watch that broke to the next; a manager that is away for longer ends the session.
+/// Pause before a broken watch is opened again; if the manager is away for longer, the session ends.
 const AGAIN: Duration = Duration::from_millis(250);
 
-/// Resolves once a lease is not whole any more, with what happened to it.
+/// Resolves with a reason once a lease is not complete any more.
 pub(super) async fn of(client: &ResourceClient, lease: &Lease) -> String {
     let mut kinds: Vec<&str> = lease.resources.iter().map(|resource| resource.kind.as_str()).collect();
     kinds.sort_unstable();
@@ -27,7 +28,7 @@ pub(super) async fn of(client: &ResourceClient, lease: &Lease) -> String {
     }
 }
 
-/// What an update says of the end of a lease.
+/// The end of the lease in an update, if there is one.
 fn told(update: &ResourceUpdate, lease: &Lease) -> Option<String> {
     let number = lease.id.0;
     match update {
@@ -49,7 +50,7 @@ fn told(update: &ResourceUpdate, lease: &Lease) -> Option<String> {
                 (ResourceEventKind::Deleted, _) => Some(format!("`{id}` was deleted")),
                 (ResourceEventKind::Released, Some((ended, _))) if ended == lease.id => {
                     Some(match event.reason.as_str() {
-                        // By its session, and by an operator.
+                        // Released by its own session, or by an operator.
                         "asked" | "revoked" => format!("lease {number} was released by another"),
                         "the resource is gone" => format!("`{id}` was deleted"),
                         reason => format!("lease {number} ended: {reason}"),

@@ -1,7 +1,8 @@
 //! `ratn resource …`: the operations of the resource manager for people and scripts.
 //!
-//! Each is one call in the name of the user that types it. What needs a session (`block`, `consume`) has one for as long as the
-//! command runs; what is created without one stays until it is deleted. Tables go to standard output, or one JSON document each.
+//! Each is one call in the name of the user who types it. Operations that need a session (`block`, `consume`) have one for as
+//! long as the command runs; what is created without a session stays until it is deleted. The output is a table, or one JSON
+//! document each.
 
 mod arguments;
 mod hold;
@@ -29,11 +30,11 @@ use ratn_worker::trace::{self, TraceContext};
 use std::time::Duration;
 
 const ROLE: &str = ratn_daemon::resource_manager::ROLE;
-/// A session that is not there by then will not come.
+/// Timeout of opening a session.
 const SESSION_DEADLINE: Duration = Duration::from_secs(5);
 const SESSION_TTL: Duration = Duration::from_secs(3);
 
-/// Where the resource manager is, and how its answers are shown.
+/// The client of the resource manager, and the output format.
 struct Asking {
     channels: Channels,
     endpoint: Endpoint,
@@ -41,7 +42,7 @@ struct Asking {
     json: bool,
 }
 
-/// Performs one operation.
+/// Performs an operation.
 pub(super) fn run(arguments: &ResourceArguments, tls: &ClientTls) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let endpoint = match &arguments.manager {
@@ -50,7 +51,7 @@ pub(super) fn run(arguments: &ResourceArguments, tls: &ClientTls) -> Result<(), 
                 .find(ROLE)
                 .map_err(|error| Failure::Refused(format!("ratn: {error}")))?,
         };
-        // A document of JSON is all that a program gets.
+        // With JSON, the document is the only output.
         if !arguments.json {
             let managers = leader::ask(&endpoint, tls).await;
             if !managers.is_empty() {
@@ -138,7 +139,7 @@ impl Asking {
         Ok(())
     }
 
-    /// Deletes what can be deleted; what cannot is said of each.
+    /// Deletes what can be deleted; reports each resource that cannot.
     async fn delete(&self, ids: &[String]) -> Result<(), Failure> {
         let (mut deleted, mut kept) = (Vec::new(), Vec::new());
         for id in ids {
@@ -157,7 +158,7 @@ impl Asking {
         if kept.is_empty() { Ok(()) } else { Err(anyhow::anyhow!(kept.join("\nratn: ")).into()) }
     }
 
-    /// What is there with other attributes is only changed where that is asked for.
+    /// An existing resource with other attributes is only changed on request.
     async fn not_there_otherwise(&self, create: &arguments::CreateArguments, wanted: &Resource) -> Result<(), Failure> {
         if create.id.is_empty() || create.update {
             return Ok(());
@@ -179,12 +180,12 @@ impl Asking {
         Err(anyhow::anyhow!(message).into())
     }
 
-    /// A session for as long as it is kept, and a client in its name.
+    /// A session, and a client in its name.
     async fn session(&self, what: &str, ttl: Duration) -> anyhow::Result<(Session, ResourceClient)> {
         let name = format!("ratn resource {what}");
         let session = Session::open(&self.channels, &self.endpoint, &name, ttl);
         if let Err(error) = session.alive(SESSION_DEADLINE).await {
-            // What the manager says to a plain question tells more than its silence.
+            // The manager's answer to a plain request tells more than a timeout.
             self.client.list(&["-"]).await?;
             return Err(
                 anyhow::Error::from(error).context("it opens no session: `block` and `consume` need the role `task`")

@@ -9,7 +9,7 @@ use ratn_proto::types::{
 use serde_json::json;
 use std::time::Duration;
 
-/// One line each: what it is, how much of it is free, who has the rest.
+/// One line per resource: what it is, how much of it is free, and who holds the rest.
 pub(super) fn table(resources: &[Resource]) -> String {
     let rows = resources.iter().map(|resource| {
         [
@@ -24,7 +24,7 @@ pub(super) fn table(resources: &[Resource]) -> String {
     columns(&["ID", "KIND", "CLASS", "HOST", "FREE", "HELD BY"], rows.collect())
 }
 
-/// Everything of one.
+/// All details of a resource.
 pub(super) fn in_full(resource: &Resource) -> String {
     let mut rows = vec![
         ["id".to_owned(), resource.id.clone()],
@@ -53,7 +53,7 @@ pub(super) fn in_full(resource: &Resource) -> String {
     aligned(&rows).join("\n")
 }
 
-/// One change in a line.
+/// A change in one line.
 pub(super) fn event(event: &ResourceEvent) -> String {
     let resource = &event.resource;
     let mut line = format!(
@@ -74,7 +74,7 @@ pub(super) fn event(event: &ResourceEvent) -> String {
     line
 }
 
-/// What waits, in the order in which it is served, and under each what is in its way.
+/// The waiting requests in the order in which they are served, each with its obstacles below.
 pub(super) fn waiting(waiting: &[WaitingAcquire]) -> String {
     let rows = waiting.iter().map(|one| {
         let (request, holder, session) = (one.request.clone(), one.holder.clone(), one.session.clone());
@@ -103,7 +103,7 @@ pub(super) fn waiting_json(waiting: &WaitingAcquire) -> serde_json::Value {
     })
 }
 
-/// Who is there.
+/// The open sessions.
 pub(super) fn sessions(sessions: &[SessionStatus]) -> String {
     let rows = sessions.iter().map(|session| {
         [
@@ -129,7 +129,7 @@ pub(super) fn session_json(session: &SessionStatus) -> serde_json::Value {
     })
 }
 
-/// What was granted.
+/// The granted lease.
 pub(super) fn lease(lease: &Lease) -> String {
     let ids: Vec<&str> = lease.resources.iter().map(|resource| resource.id.as_str()).collect();
     format!("lease {} token {}: {}", lease.id.0, lease.token.0, ids.join(" "))
@@ -183,7 +183,7 @@ pub(super) fn update_json(update: &ResourceUpdate) -> serde_json::Value {
     }
 }
 
-/// Simple values as JSON has them, others as they are printed.
+/// Simple values as JSON values, others as text.
 fn plain(value: &Value) -> serde_json::Value {
     match value {
         Value::Null => serde_json::Value::Null,
@@ -195,7 +195,7 @@ fn plain(value: &Value) -> serde_json::Value {
     }
 }
 
-/// What is free of what there is, and how it is to be had.
+/// The free amount, the total, and whether it is divisible or consumable.
 fn amounts(resource: &Resource) -> String {
     let parts = if resource.divisible { ", in parts" } else { "" };
     let spent = if resource.renewable { "" } else { ", gone when it is consumed" };

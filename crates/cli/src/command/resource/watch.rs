@@ -1,4 +1,5 @@
-//! `watch`: the resources, then every change. A manager that restarts is watched again from the last change that was shown.
+//! `watch`: the resources, then every change. After a restart of the manager, the watch continues from the last change that
+//! was shown.
 
 use super::{Asking, show};
 use crate::output;
@@ -7,12 +8,12 @@ use ratn_proto::types::{ResourceUpdate, WatchPosition};
 use ratn_worker::client::{CallError, ResourceWatch};
 use std::time::{Duration, Instant};
 
-/// A manager that is not heard for longer ends the watch.
+/// A manager that is unreachable for longer ends the watch.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// From a watch that broke to the next.
+/// Pause before a broken watch is opened again.
 const AGAIN: Duration = Duration::from_millis(250);
 
-/// Until the reader has had enough, or nobody answers any more.
+/// Runs until the reader closes, or nobody answers any more.
 pub(super) async fn watch(asking: &Asking, kinds: &[&str]) -> anyhow::Result<()> {
     let mut after: Option<WatchPosition> = None;
     let mut watch = asking.client.watch(kinds).await?;
@@ -44,7 +45,7 @@ pub(super) async fn watch(asking: &Asking, kinds: &[&str]) -> anyhow::Result<()>
     }
 }
 
-/// The watch from where it broke off; with a snapshot where the changes since then are not all known.
+/// Continues the watch where it broke off; with a snapshot where some changes since then are lost.
 async fn again(asking: &Asking, kinds: &[&str], after: Option<WatchPosition>) -> Result<ResourceWatch, CallError> {
     let began = Instant::now();
     loop {

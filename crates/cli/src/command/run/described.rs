@@ -1,5 +1,5 @@
-//! The program of a task on a system that runs. What workers say of themselves extends the catalogue; those that have just been started again have
-//! not said it yet: they are waited for.
+//! The program of a task on a running system. The workers' descriptions extend the catalogue; workers that are just restarting have not described
+//! themselves yet, and are waited for.
 
 use crate::command::check;
 use crate::failure::Failure;
@@ -13,14 +13,14 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Workers that are away, and process managers that do not answer, are waited for so long.
+/// How long workers that are away, and process managers that do not answer, are waited for.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// And are asked for so often.
+/// Interval at which they are asked.
 const POLL: Duration = Duration::from_millis(250);
-/// What the findings are called of an action that nobody has described.
+/// Rules of findings about an action without a description.
 const NOT_DESCRIBED: [&str; 2] = ["unknown-provider", "unknown-action"];
 
-/// Loads the task; where it performs what the catalogue does not have, and workers of the system are away, when they have described themselves.
+/// Loads the task. Where it uses an action that the catalogue does not have, and workers of the system are away, waits for their descriptions.
 pub(super) async fn program(
     task: &Path,
     from: Option<&str>,
@@ -57,7 +57,7 @@ pub(super) async fn program(
     }
 }
 
-/// Whoever could say it is not being started any more.
+/// The failure when the workers that could describe the action are not started any more.
 fn given_up(findings: &[Diagnostic], given_up: &BTreeMap<String, String>) -> Failure {
     if given_up.is_empty() {
         return check::refused(findings);

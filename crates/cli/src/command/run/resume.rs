@@ -1,4 +1,5 @@
-//! `ratn run --resume LOG`: what can be said against it before anything of the run is touched, then the run.
+//! `ratn run --resume LOG`: checks whether the run can be resumed before anything is changed, then resumes
+//! it.
 
 use super::{Beside, conclude, described};
 use crate::arguments::RunArguments;
@@ -13,7 +14,7 @@ use ratn_task_control::shell::{self, Resumption};
 use ratn_worker::tls::ClientTls;
 use std::path::Path;
 
-/// Goes on with the run that `file` tells of.
+/// Resumes the run whose log is `file`.
 pub(super) async fn run(
     arguments: &RunArguments,
     file: &Path,
@@ -28,9 +29,9 @@ pub(super) async fn run(
     if let Some(chart) = &arguments.gantt {
         output::check_writable(chart)?;
     }
-    // What is said wrongly is refused first.
+    // Wrong arguments are refused first.
     Beside::of(arguments)?;
-    // From here on nobody else goes on with it.
+    // From here on no other process can resume it.
     let log = |error| refused(&format_args!("{:#}", anyhow::Error::from(error)));
     let writer = LogWriter::go_on(file).map_err(log)?;
     let history = History::of(&writer, output::messages()).map_err(log)?;
@@ -55,7 +56,7 @@ pub(super) async fn run(
         error = system.one_ended() => Err(error.context("a part of the system ended during the run")),
     };
     let ended = match ended {
-        // It has ended, and there is nothing to do.
+        // The run has ended, so there is nothing to do.
         Err(error) if error.is::<ReplayError>() => return Err(refused(&error)),
         ended => ended?,
     };

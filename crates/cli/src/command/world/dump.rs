@@ -1,8 +1,8 @@
-//! Facts in JSON, exactly: what is read is what was written, to the last bit of every number.
+//! Facts in exact JSON: what is read is what was written, to the last bit of every number.
 //!
 //! `{"revision": 7, "facts": [{"predicate": "at", "arguments": ["box_1"], "value": {"pose": {…}}, "revision": 3, "writer": "place[1]",
-//! "measured": {"source": "camera", "certainty": {"confidence": 0.9}}}]}`; a value says its kind. To load one, predicate, arguments,
-//! value and `measured` are read.
+//! "measured": {"source": "camera", "certainty": {"confidence": 0.9}}}]}`; a value names its kind. Loading a dump uses predicate,
+//! arguments, value and `measured`.
 
 use anyhow::{Context, ensure};
 use ratn_model::fact::{FactKey, Term};
@@ -31,7 +31,7 @@ struct DumpedFact {
     measured: Option<Arc<Measurement>>,
 }
 
-/// Facts of one revision.
+/// The facts of one revision.
 pub(super) fn json(revision: Revision, facts: &[FactRecord]) -> serde_json::Value {
     let facts: Vec<serde_json::Value> = facts.iter().map(fact).collect();
     serde_json::json!({ "revision": revision.0, "facts": facts })
@@ -47,11 +47,11 @@ pub(super) fn fact(fact: &FactRecord) -> serde_json::Value {
         writer: fact.writer.clone(),
         measured: fact.measured.clone(),
     };
-    // Nothing in it can fail: no maps whose keys are no text.
+    // This cannot fail: there are no maps with keys that are not strings.
     serde_json::to_value(dumped).unwrap_or_default()
 }
 
-/// What [`json`] wrote.
+/// Reads what [`json`] wrote.
 pub(super) fn read(text: &str) -> anyhow::Result<Vec<FactRecord>> {
     let dump: Dump = serde_json::from_str(text).context("not what `ratn world dump` writes")?;
     let fact = |fact: DumpedFact| FactRecord {
@@ -66,7 +66,7 @@ pub(super) fn read(text: &str) -> anyhow::Result<Vec<FactRecord>> {
     Ok(facts)
 }
 
-/// Of two values for one fact it is not known which is meant.
+/// Refuses two values for one fact, because it is unknown which is meant.
 pub(super) fn once(facts: &[FactRecord]) -> anyhow::Result<()> {
     let mut seen = std::collections::BTreeSet::new();
     let twice = facts.iter().find(|fact| !seen.insert(&fact.key));
@@ -147,7 +147,7 @@ pub(super) mod tests {
         #[test]
         fn a_dump_in_either_format_is_read_as_it_was_written(facts in facts()) {
             let text = serde_json::to_string_pretty(&json(Revision(7), &facts)).unwrap();
-            // As text: what compares equal may differ in its sign.
+            // Compared as text, because equal numbers may differ in their sign.
             prop_assert_eq!(format!("{:?}", read(&text).unwrap()), format!("{:?}", &facts), "{}", text);
             let text = turtle::write(&facts).unwrap();
             let told: Vec<FactRecord> = facts

@@ -1,7 +1,7 @@
 //! `ratn world …`: the root world model for people and scripts.
 //!
-//! Queries are answered here, over the facts that the pool gives: they cost the pool nothing but a view. Tables go to standard output, or
-//! one JSON document each, in which values are exact. A dump says everything exactly, in JSON or in Turtle; loading one is one commit.
+//! Queries are answered here, over the facts that the pool sends: they cost the pool only a view. The output is a table, or one JSON
+//! document each, in which values are exact. A dump contains all facts exactly, in JSON or in Turtle; loading one is one commit.
 
 mod arguments;
 mod dump;
@@ -35,9 +35,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 const ROLE: &str = ratn_daemon::world_pool::ROLE;
-/// Of a dump in JSON, which is longer than the message that it becomes.
+/// Maximum size of a dump; JSON is longer than the message that it becomes.
 const MAX_DUMP: usize = 8 * MAX_MESSAGE_BYTES;
-/// Who writes what is loaded.
+/// The writer of loaded facts.
 const WRITER: &str = "ratn world load";
 
 /// Why `--sparql` is refused by a `ratn` that was built without it.
@@ -46,13 +46,13 @@ const NO_SPARQL: &str = "ratn: --sparql: this ratn was built without the feature
     `cargo install --path crates/cli --features sparql`, or ask with the conditions of task files: \
     `ratn world query 'at(?box) = ?pose'`";
 
-/// Where the world pool is, and how its answers are shown.
+/// The client of the world pool, and the output format.
 struct Asking {
     client: WorldClient,
     json: bool,
 }
 
-/// Performs one operation.
+/// Performs an operation.
 pub(super) fn run(arguments: &WorldArguments, tls: &ClientTls) -> Result<(), Failure> {
     #[cfg(not(feature = "sparql"))]
     if matches!(arguments.command, WorldCommand::Query { sparql: true, .. }) {
@@ -72,7 +72,7 @@ pub(super) fn run(arguments: &WorldArguments, tls: &ClientTls) -> Result<(), Fai
     })
 }
 
-/// Says which predicates no fact is about: an answer of nothing may be a slip of the pen.
+/// Reports predicates without any facts: an empty answer may come from a typing error.
 fn unheard_of<'a>(asked: impl Iterator<Item = &'a str>, facts: &[FactRecord]) {
     let known: BTreeSet<&str> = facts.iter().map(|fact| fact.key.predicate.as_str()).collect();
     for predicate in asked.filter(|predicate| !known.contains(predicate)).collect::<BTreeSet<_>>() {
@@ -163,7 +163,7 @@ impl Asking {
         let facts = read.map_err(|error| refused(&format!("{error:#}")))?;
         let (mut changes, mut revision) = (Vec::new(), None);
         if replace {
-            // Refused where somebody commits in between: what they wrote would be gone unseen.
+            // Refused where another client commits in between: its facts would be deleted unnoticed.
             let (root, before) = self.client.root_at(None, &[]).await?;
             revision = Some(Revision(root.0 + 1));
             let every = |fact: FactRecord| FactPattern {
@@ -183,7 +183,7 @@ impl Asking {
         Ok(self.show(&json, || format!("{count} facts, revision {}", revision.0))?)
     }
 
-    /// Until the reader has had enough, or the pool ends.
+    /// Runs until the reader closes, or the pool ends.
     async fn watch(&self, patterns: &[FactPattern], after: Option<Revision>) -> anyhow::Result<()> {
         let mut watch = self.client.watch(after, patterns).await?;
         let mut ended: Result<(), CallError> = Ok(());

@@ -10,7 +10,7 @@ use ratn_proto::types::{FactDifference, FactRecord, FactVersion, WorldChange, Wo
 use ratn_world::query::Rows;
 use serde_json::json;
 
-/// One line each.
+/// One line per fact.
 pub(super) fn facts(facts: &[FactRecord]) -> String {
     let rows = facts.iter().map(|fact| {
         [
@@ -24,12 +24,13 @@ pub(super) fn facts(facts: &[FactRecord]) -> String {
     columns(&["FACT", "VALUE", "REVISION", "WRITER", "MEASURED BY"], rows.collect())
 }
 
-/// A value as a task file says it, where it can.
+/// A value as in a task file, where that is possible.
 fn said(value: &Value) -> String {
     task_text::value(value).unwrap_or_else(|| value.to_string())
 }
 
-/// One line each: as it was, as it is, and who made it so; who deletes a fact is not kept.
+/// One line each: the value before, the value after, and the writer; the writer of a deletion is
+/// not kept.
 pub(super) fn differences(differences: &[FactDifference]) -> String {
     let value = |fact: &Option<FactRecord>| fact.as_ref().map_or_else(|| "-".to_owned(), |fact| said(&fact.value));
     let rows = differences.iter().map(|one| {
@@ -52,7 +53,7 @@ pub(super) fn differences_json(from: Revision, to: Revision, differences: &[Fact
     json!({ "from": from.0, "to": to.0, "differences": differences })
 }
 
-/// One line each, the newest first, and from where on nothing is known.
+/// One line each, newest first, and the revision before which nothing is known.
 pub(super) fn versions(key: &FactKey, oldest: Revision, versions: &[FactVersion]) -> String {
     if versions.is_empty() {
         return format!("{key} never was, since revision {}, the oldest that is kept", oldest.0);
@@ -81,7 +82,7 @@ pub(super) fn versions_json(oldest: Revision, versions: &[FactVersion]) -> serde
     json!({ "oldest": oldest.0, "versions": versions })
 }
 
-/// A revision, and below what it wrote.
+/// A revision, and below it what was written.
 pub(super) fn change(change: &WorldChange) -> String {
     let commit = if change.commit.is_empty() { "too old" } else { &change.commit };
     let by = change.writer.as_deref().map_or_else(String::new, |writer| format!(" by {writer}"));
@@ -112,7 +113,7 @@ pub(super) fn update_json(update: &WorldUpdate) -> serde_json::Value {
     }
 }
 
-/// One line an answer; a query without variables is true or not.
+/// One line per answer; a query without variables is answered yes or no.
 pub(super) fn rows(rows: &Rows) -> String {
     if rows.variables.is_empty() {
         return if rows.rows.is_empty() { "no" } else { "yes" }.to_owned();
@@ -121,7 +122,7 @@ pub(super) fn rows(rows: &Rows) -> String {
     table(&rows.variables, cells.collect(), rows.more)
 }
 
-/// What variables are in each row; `more` says that there are more rows.
+/// The values of variables in each row; `more` says that there are more rows.
 pub(super) fn table(variables: &[String], rows: Vec<Vec<String>>, more: bool) -> String {
     let head: Vec<String> = variables.iter().map(|name| format!("?{name}")).collect();
     let mut lines = aligned(&[vec![head], rows].concat());
@@ -143,7 +144,7 @@ fn measured(measured: &Measurement, value: &Value) -> String {
     }
 }
 
-/// The greatest standard deviation; of a pose that of its place and of its turn.
+/// The greatest standard deviation; for a pose that of its position and of its rotation.
 fn deviation(entries: &[f64], value: &Value) -> String {
     let rows = entries.len().isqrt();
     let greatest = |from: usize, to: usize| {
@@ -155,7 +156,7 @@ fn deviation(entries: &[f64], value: &Value) -> String {
     }
 }
 
-/// Four digits at the most.
+/// Four decimals at most.
 fn short(number: f64) -> f64 {
     (number * 1e4).round() / 1e4
 }

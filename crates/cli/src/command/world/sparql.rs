@@ -1,8 +1,9 @@
 //! SPARQL over a snapshot of the root, for people: `ratn world query --sparql 'SELECT …'`.
 //!
-//! The facts are as `dump --format turtle` has them: `?f world:predicate "at" ; world:argument1 ?box ; world:value ?pose`. Here each
-//! also says its `world:revision` and, where it has one, its `world:writer`. The prefixes `world`, `xsd` and `rdf` are known.
-//! `ratn_sparql` evaluates and bounds a query. A `ratn` without the feature `sparql` says so instead, and this module is not in it.
+//! The facts are as in `dump --format turtle`: `?f world:predicate "at" ; world:argument1 ?box ; world:value ?pose`. In addition
+//! each has its `world:revision` and, where known, its `world:writer`. The prefixes `world`, `xsd` and `rdf` are predefined.
+//! `ratn_sparql` evaluates and bounds a query. Without the feature `sparql`, `ratn` refuses the query and does not contain this
+//! module.
 
 use super::show;
 use super::turtle::{self, RDF, WORLD, XSD};
@@ -17,7 +18,7 @@ use serde_json::json;
 /// Answers a query over facts, with at most `limit` rows.
 ///
 /// # Errors
-/// What is wrong with the query, or that it takes too long.
+/// An error in the query, or a query that takes too long.
 pub(super) fn answer(text: &str, facts: &[FactRecord], limit: usize) -> anyhow::Result<Answer> {
     let mut triples = Vec::new();
     for (number, fact) in facts.iter().enumerate() {
@@ -28,7 +29,7 @@ pub(super) fn answer(text: &str, facts: &[FactRecord], limit: usize) -> anyhow::
     Ok(ratn_sparql::answer(text, &prefixes, triples, limit)?)
 }
 
-/// Who wrote a fact when. A dump does not say it, because nobody can load it.
+/// The revision and the writer of a fact. A dump leaves them out, because they cannot be loaded.
 fn origin(number: usize, fact: &FactRecord) -> anyhow::Result<Vec<Triple>> {
     let revision = Literal::new_typed_literal(fact.revision.0.to_string(), xsd::INTEGER);
     let mut said: Vec<(String, Term)> = vec![("revision".to_owned(), revision.into())];
@@ -37,7 +38,7 @@ fn origin(number: usize, fact: &FactRecord) -> anyhow::Result<Vec<Triple>> {
     turtle::of_fact(number, said)
 }
 
-/// For people.
+/// Text for people.
 pub(super) fn table(answer: &Answer) -> String {
     match answer {
         Answer::Truth(truth) => if *truth { "yes" } else { "no" }.to_owned(),
@@ -48,7 +49,7 @@ pub(super) fn table(answer: &Answer) -> String {
     }
 }
 
-/// For programs: each term as SPARQL and Turtle write it.
+/// JSON for programs: each term as in SPARQL and Turtle.
 pub(super) fn json(revision: Revision, answer: &Answer) -> serde_json::Value {
     match answer {
         Answer::Truth(truth) => json!({ "revision": revision.0, "truth": truth }),

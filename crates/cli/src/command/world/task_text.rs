@@ -1,6 +1,7 @@
-//! Facts as a task file says them, so that what is shown can be pasted there.
+//! Facts in the syntax of a task file, so that the output can be pasted there.
 //!
-//! Numbers are rounded to a micrometre or microradian; JSON and dumps are exact. Orientations are roll, pitch and yaw.
+//! Numbers are rounded to a micrometre or microradian; JSON and dumps are exact. Orientations are given as roll, pitch
+//! and yaw.
 
 use ratn_model::fact::{FactKey, Term};
 use ratn_model::pose::Pose;
@@ -8,16 +9,16 @@ use ratn_model::value::Value;
 use ratn_proto::types::FactRecord;
 use std::f64::consts::FRAC_PI_2;
 
-/// A smaller number keeps all its digits.
+/// A smaller number (from 1e-6 on) is written with nine decimals.
 const SMALL: f64 = 1e-3;
-/// A larger number is whole, and is written with its exponent.
+/// A larger number is an integer, and is written with an exponent.
 const LARGE: f64 = 1e16;
-/// So near to a pitch of a right angle roll and yaw turn about one axis.
+/// At a pitch this close to a right angle, roll and yaw turn about the same axis.
 const UPRIGHT: f64 = 1.0 - 1e-9;
-/// Words that an expression does not read as texts.
+/// Words that an expression does not read as text.
 const KEYWORDS: [&str; 9] = ["true", "false", "null", "and", "or", "not", "in", "exists", "by"];
 
-/// The `world` of a task in which these facts hold; what a task cannot say is a comment.
+/// The `world` section of a task with these facts; facts that a task cannot express are comments.
 pub(super) fn world(facts: &[FactRecord]) -> String {
     let line = |fact: &FactRecord| match value(&fact.value) {
         Some(said) => format!("  - '{}'", format!("{} = {said}", key(&fact.key)).replace('\'', "''")),
@@ -39,7 +40,7 @@ pub(super) fn key(key: &FactKey) -> String {
     format!("{}({})", key.predicate, arguments.join(", "))
 }
 
-/// A value as an expression; `None` for what none stands for.
+/// A value as an expression; `None` for values without one.
 pub(super) fn value(value: &Value) -> Option<String> {
     Some(match value {
         Value::Null => "null".to_owned(),
@@ -81,7 +82,7 @@ fn pose(pose: &Pose) -> String {
     format!("pose({})", numbers.join(", "))
 }
 
-/// Without zeros at the end.
+/// Without trailing zeros.
 fn rounded(number: f64) -> String {
     if number != 0.0 && number.abs() < SMALL && number.abs() >= 1e-6 {
         return format!("{number:.9}").trim_end_matches('0').trim_end_matches('.').to_owned();
@@ -119,7 +120,7 @@ mod tests {
         FactRecord { key, value, revision: Revision(1), writer: None, measured: None }
     }
 
-    /// The values that a task begins with, in the order of its file.
+    /// The initial values of a task, in the order of its file.
     fn pasted(world: &str) -> Vec<Value> {
         let source = format!("task: pasted\n{world}\nstates: []\n");
         let loaded = ratn_model::load::load(&source, "pasted.yaml", &Catalogue::standard());

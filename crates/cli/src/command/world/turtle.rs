@@ -1,11 +1,11 @@
-//! Facts in Turtle, exactly. Every fact is a node of its own, so that arguments and values of any kind have a place:
+//! Facts in exact Turtle. Every fact is a separate node, so that arguments and values of any kind can be represented:
 //!
 //! ```turtle
 //! @prefix world: <urn:ratn:world#> .
 //! [] world:predicate "at" ; world:argument1 "box_1" ; world:value "{\"pose\":…}"^^rdf:JSON .
 //! ```
-//! Truth values, whole numbers, numbers and texts are the literals of XML Schema, no value is `world:null`, and what RDF has no type for
-//! is JSON as in [`super::dump`]. `world:measured` says in the same way what measured a fact.
+//! Truth values, integers, floats and texts are XML Schema literals, null is `world:null`, and values without an RDF type are JSON as in
+//! [`super::dump`]. `world:measured` describes the measurement of a fact in the same way.
 
 use super::dump;
 use anyhow::{Context, bail, ensure};
@@ -20,7 +20,7 @@ use ratn_proto::types::FactRecord;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Of the properties.
+/// The namespace of the properties.
 pub(super) const WORLD: &str = "urn:ratn:world#";
 pub(super) const RDF: &str = "http://www.w3.org/1999/02/22-rdf-syntax-ns#";
 pub(super) const XSD: &str = "http://www.w3.org/2001/XMLSchema#";
@@ -28,10 +28,10 @@ const PREDICATE: &str = "predicate";
 const VALUE: &str = "value";
 const MEASURED: &str = "measured";
 const NULL: &str = "null";
-/// With a number behind it, from 1.
+/// Followed by a number, from 1.
 const ARGUMENT: &str = "argument";
 const RDF_JSON: NamedNodeRef<'_> = NamedNodeRef::new_unchecked("http://www.w3.org/1999/02/22-rdf-syntax-ns#JSON");
-/// More arguments than any fact has.
+/// Maximum number of arguments.
 const MAX_ARGUMENTS: usize = 64;
 
 /// All facts as one document.
@@ -47,7 +47,7 @@ pub(super) fn write(facts: &[FactRecord]) -> anyhow::Result<String> {
     Ok(String::from_utf8(writer.finish()?)?)
 }
 
-/// What is said of a fact, the `number`th.
+/// The triples of a fact, the `number`th.
 pub(super) fn triples(number: usize, fact: &FactRecord) -> anyhow::Result<Vec<Triple>> {
     let argument = |(position, argument): (usize, &Term)| {
         let literal = match argument {
@@ -66,7 +66,7 @@ pub(super) fn triples(number: usize, fact: &FactRecord) -> anyhow::Result<Vec<Tr
     of_fact(number, said)
 }
 
-/// Triples about a fact, the `number`th: properties and their values.
+/// Triples with the given properties and values about the `number`th fact.
 pub(super) fn of_fact(number: usize, said: Vec<(String, RdfTerm)>) -> anyhow::Result<Vec<Triple>> {
     let subject = BlankNode::new(format!("fact{number}"))?;
     let triple = |(property, object): (String, RdfTerm)| {
@@ -75,7 +75,7 @@ pub(super) fn of_fact(number: usize, said: Vec<(String, RdfTerm)>) -> anyhow::Re
     said.into_iter().map(triple).collect()
 }
 
-/// What [`write()`] wrote. Revisions and writers are not in it.
+/// Reads what [`write()`] wrote. Revisions and writers are not included.
 pub(super) fn read(text: &str) -> anyhow::Result<Vec<FactRecord>> {
     let mut subjects: BTreeMap<String, BTreeMap<String, RdfTerm>> = BTreeMap::new();
     for triple in TurtleParser::new().for_slice(text.as_bytes()) {
@@ -124,7 +124,7 @@ fn object(value: &Value) -> anyhow::Result<RdfTerm> {
         Value::Null => NamedNode::new(format!("{WORLD}{NULL}"))?.into(),
         Value::Bool(truth) => Literal::new_typed_literal(truth.to_string(), xsd::BOOLEAN).into(),
         Value::Int(whole) => Literal::new_typed_literal(whole.to_string(), xsd::INTEGER).into(),
-        // The shortest text that is this number, with an exponent, as a double has it.
+        // The shortest text for this number, with an exponent, as doubles require.
         Value::Float(number) => Literal::new_typed_literal(format!("{number:E}"), xsd::DOUBLE).into(),
         Value::String(text) => Literal::new_simple_literal(text).into(),
         other => json(other)?,
