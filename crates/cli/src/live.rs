@@ -158,8 +158,7 @@ fn page(run: &Timeline, width: usize, height: usize, colours: Colours) -> Vec<St
     lines
 }
 
-/// For example `fetch_boxes in CDTN mode: 12.3 s  [#####...............] 12 of 35 states have ended; ahead of time: 3 of use (8.0 s), 1
-/// discarded (2.0 s)`.
+/// `fetch_boxes in CDTN mode: 12.3 s  [#####...............] 12 of 35 states have ended; ahead of time: 3 of use (8.0 s), 1 discarded (2.0 s)`
 fn head(run: &Timeline) -> String {
     let (ended, known) = (run.count.retired, run.count.expanded - run.count.squashed);
     let full = (BAR * ended).checked_div(known).unwrap_or(0).min(BAR);

@@ -1,4 +1,4 @@
-//! The audit log, as in every server ([`ratn_worker::audit`]); this module also writes it to the file that
-//! a daemon's config names.
+//! The audit log, as in every server ([`ratn_worker::audit`]); a daemon writes it to the file that its
+//! config names.
 
 pub use ratn_worker::audit::*;

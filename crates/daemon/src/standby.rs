@@ -119,7 +119,7 @@ impl Place<'_> {
                     tokio::time::sleep(AGAIN).await;
                     why
                 }
-                // Another host may accept the restored state, for all.
+                // Another host may accept the restored state, which then counts for all hosts.
                 Err(JournalError::Open { source: error @ OpenError::Restored { .. }, .. }) => {
                     let why = error.to_string();
                     if news(&standby, &why) {

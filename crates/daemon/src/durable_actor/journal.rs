@@ -1,8 +1,8 @@
 //! The journal keeps a daemon's state over a restart: a log of entries, which a snapshot replaces from time to time.
 //!
 //! ```text
-//!   state ──entries──▶ log ──durable──▶ outbox: what depended on them leaves
-//!     └────snapshot──▶ log (in the background, when there is more to replay than is worth it)
+//!   state ──entries──▶ log ──durable──▶ outbox: replies that depend on them are sent
+//!     └────snapshot──▶ log (in the background, when replaying the entries would take too long)
 //! ```
 //! The state defines what an entry and a snapshot mean: [`Journaled`] makes them, a `restore` function reads them back.
 

@@ -2,10 +2,10 @@
 //! any other is started.
 //!
 //! ```text
-//!   its process is gone ──▶ forgotten
-//!   it serves, its template says `adopt`, it was told of the session of now, and it listens for a successor ──▶ adopted
-//!   everybody else ──▶ SIGTERM, after `stop_timeout_s` SIGKILL, and with it all that it started
-//!   it was about to be started ──▶ its group is ended, and whatever carries its marker
+//!   its process has ended ──▶ forgotten
+//!   it serves, its template says `adopt`, it knows the present session, and it listens for a successor ──▶ adopted
+//!   any other ──▶ SIGTERM, after `stop_timeout_s` SIGKILL, and with it all processes that it started
+//!   it was about to be started ──▶ its cgroup is killed, and every process with its marker
 //! ```
 
 use super::account;

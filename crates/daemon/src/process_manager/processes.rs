@@ -111,7 +111,7 @@ struct Process {
     /// The directory of the worker's files.
     directory: RuntimeDirectory,
     pid: u32,
-    /// The template that the worker was started from, and the session that it was told offers it, until the roster has them.
+    /// The worker's template, and the session that it was told offers it, until the roster has them.
     started: Option<(Template, String)>,
     /// Dropped when the process is known; the readiness check waits for that.
     known: Option<oneshot::Sender<()>>,

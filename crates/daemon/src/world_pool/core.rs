@@ -88,7 +88,7 @@ pub(super) struct ProjectRequest {
     pub(super) after: Option<String>,
     pub(super) base: Revision,
     pub(super) changes: Vec<Change>,
-    /// The node that will make the change at the same index; empty or missing if unknown.
+    /// The node that will make the change at the same index; empty or missing for no node.
     pub(super) writers: Vec<Arc<str>>,
     pub(super) reads: Footprint,
     pub(super) held_by: HeldBy,

@@ -3,7 +3,7 @@
 //!
 //! ```text
 //!   gRPC call ──▶ service.rs ──message──▶ actor.rs (core.rs) ◀──leases that live── leases.rs ◀──watch── resource manager
-//!   core.rs (history.rs) ──commits──▶ journal (ratn-storage) ──durable──▶ outbox ──▶ what tells of them leaves
+//!   core.rs (history.rs) ──commits──▶ journal (ratn-storage) ──durable──▶ outbox ──▶ answers and updates of watches
 //! ```
 //! After a restart the root, its revisions and the commit ids are as they were when the last answer was sent; projections have ended.
 //! Which effects are projected, and when they become real, is task control's business.

@@ -93,8 +93,8 @@ impl DeadbandFilter {
     }
 }
 
-/// Whether two values are at least a step apart. Exactly zero and exactly all are always published, because near the ends there is no room for
-/// a whole step.
+/// Whether two values are at least a step apart. A change to exactly zero always counts, because there may be no room for a whole step above
+/// zero.
 fn far(was: f64, is: f64, step: f64) -> bool {
     (was - is).abs() >= step || (is == 0.0 && was != 0.0)
 }

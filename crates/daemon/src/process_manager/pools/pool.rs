@@ -1,4 +1,4 @@
-//! The workers of one template: as many as its size wants, restarted as its restart policy allows.
+//! The workers of one template: as many as its size says, restarted as its restart policy allows.
 
 use super::command::{Command, PoolError};
 use super::demand::Demanded;

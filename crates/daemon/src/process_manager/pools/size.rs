@@ -1,7 +1,7 @@
 //! The desired size of a pool.
 //!
 //! ```text
-//!   wanted = max(asked for (at least `min`), held) + spares,   or what is demanded or queued for where that is more;   `max` at the most
+//!   wanted = max(asked (at least `min`), held) + spares, or demanded or queued where that is more; at most `max`
 //! ```
 //! Idle workers above this size end after a while, those that have been idle for longest first; held workers never do. Demand (`demanded`)
 //! is for workers that do not exist, and counts while it lasts. The queue (`queued`) waits for workers that exist and are held: a worker
