@@ -647,7 +647,7 @@ mod tests {
         for way in all {
             // A list of numbers is named by the list.
             let key = way.iter().rev().find(|step| step.parse::<usize>().is_err()).unwrap();
-            // No key expects a date; where a string is allowed, a date is valid as the key requires.
+            // No key takes a date. A value of `odd` may be one that the key takes; otherwise the refusal names the key.
             let refused = parse(&replaced(&config, &way, date.clone()), "x.toml").unwrap_err();
             assert!(format!("{refused:#}").contains(key.as_str()), "{way:?}: {refused:#}");
             for value in &odd {
