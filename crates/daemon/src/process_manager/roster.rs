@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 /// Pause between two tries to take the lock.
 const TAKE_AGAIN: Duration = Duration::from_millis(10);
-/// Number of outdated lines at which the file is rewritten.
+/// Number of lines, beyond two per known worker or motion, above which the file is rewritten.
 const MOST_OLD_LINES: usize = 1_000;
 
 /// A worker as its process manager knew it.
