@@ -1,4 +1,4 @@
-//! The keys in etcd, and how a transaction of them is written.
+//! The keys in etcd, and helpers that build transactions of them.
 //!
 //! ```text
 //!   PREFIX/meta                       which log this is, and of which format
@@ -13,7 +13,7 @@
 //!   PREFIX/snapshot/current           which snapshot counts
 //!   PREFIX/snapshot/THROUGH/PART      a snapshot
 //! ```
-//! Positions and parts have as many digits as the largest, so that keys are in the order of what they stand for.
+//! Positions and parts have a fixed number of digits, so that the order of the keys is the order of positions and parts.
 
 use super::wire::{
     Compare, DeleteRangeRequest, KeyValue, PutRequest, RangeRequest, RequestOp, compare, request_op, response_op,
@@ -28,7 +28,7 @@ pub(super) struct Keys {
     prefix: String,
 }
 
-/// A range of keys, its end not included.
+/// A half-open range of keys.
 pub(super) type Span = (Bytes, Bytes);
 
 impl Keys {
@@ -80,7 +80,7 @@ impl Keys {
         self.key(&format!("log/{:020}/{part:06}", first.0))
     }
 
-    /// Every frame whose first record is one of these.
+    /// Every frame whose first record is in this range.
     pub(super) fn frames(&self, from: Position, before: Position) -> Span {
         (self.key(&format!("log/{:020}", from.0)), self.key(&format!("log/{:020}", before.0)))
     }
@@ -99,12 +99,12 @@ impl Keys {
         (self.key(&format!("snapshot/{:020}/", through.0)), self.key(&format!("snapshot/{:020}0", through.0)))
     }
 
-    /// Every part of every older snapshot.
+    /// Every part of all older snapshots.
     pub(super) fn snapshots_before(&self, through: Position) -> Span {
         (self.key("snapshot/0"), self.key(&format!("snapshot/{:020}", through.0)))
     }
 
-    /// Every part of every younger snapshot; `current` is behind all of them.
+    /// Every part of all newer snapshots; `current` sorts after all of them.
     pub(super) fn snapshots_after(&self, through: Position) -> Span {
         (self.key(&format!("snapshot/{:020}", through.next().0)), self.key("snapshot/c"))
     }
@@ -114,7 +114,7 @@ impl Keys {
     }
 }
 
-/// Holds if the key was last written at this revision; at 0, if it is not there.
+/// A condition: the key was last written at this revision; 0: the key does not exist.
 pub(super) fn written_at(key: Bytes, revision: i64) -> Compare {
     Compare {
         result: compare::CompareResult::Equal.into(),
@@ -144,12 +144,12 @@ pub(super) fn delete_span((key, range_end): Span) -> RequestOp {
     op(request_op::Request::RequestDeleteRange(DeleteRangeRequest { key, range_end }))
 }
 
-/// Only looks.
+/// A read-only transaction.
 pub(super) fn look(success: Vec<RequestOp>) -> TxnRequest {
     TxnRequest { success, ..TxnRequest::default() }
 }
 
-/// What a range found; nothing where the operation was another one.
+/// The keys that a range request found; none if the operation was another one.
 pub(super) fn found(response: Option<ResponseOp>) -> (Vec<KeyValue>, bool) {
     match response.and_then(|response| response.response) {
         Some(response_op::Response::ResponseRange(range)) => (range.kvs, range.more),

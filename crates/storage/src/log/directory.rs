@@ -18,7 +18,7 @@ pub(super) const UNFINISHED_COPY: &str = "unfinished-copy";
 pub(super) const MOVED: &str = "moved-to";
 const TEMPORARY: &str = "tmp";
 
-/// What is there, in order.
+/// The files in the directory, in order.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Listing {
     pub(super) segments: Vec<u64>,
@@ -34,12 +34,12 @@ pub(super) fn snapshot(directory: &Path, through: Position) -> PathBuf {
     directory.join(format!("snapshot-{:020}.snap", through.0))
 }
 
-/// The name of a file that is not finished.
+/// The temporary name of an unfinished file.
 pub(super) fn temporary(path: &Path) -> PathBuf {
     path.with_extension(TEMPORARY)
 }
 
-/// Nothing where there is no such directory. Files of other names are not ours and are left alone.
+/// Empty if the directory does not exist. Files with other names do not belong to the log and are ignored.
 pub(super) fn list(directory: &Path) -> io::Result<Listing> {
     let mut listing = Listing::default();
     let entries = match fs::read_dir(directory) {
