@@ -36,7 +36,7 @@ const FOR_EVER: Duration = Duration::from_secs(1_000_000_000);
 /// Maximum number of revisions buffered for Python; further ones wait in the world pool.
 const MAX_UPDATES: usize = 64;
 
-/// What speaks to the system whose endpoint files are in a directory.
+/// A client of the system whose endpoint files are in a directory.
 #[pyclass(frozen, module = "ratn")]
 pub(crate) struct Client {
     runtime: Arc<OwnRuntime>,

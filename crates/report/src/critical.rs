@@ -101,7 +101,7 @@ fn step<'r>(
     }
 }
 
-/// What let an instance begin that did run.
+/// The cause that let a running instance begin.
 fn began_on(instance: &Instance, index: usize) -> String {
     let waits = instance.phases[..index].iter().rev().find(|phase| phase.stage == Stage::Waiting);
     let cause = waits.map_or(&instance.expanded_by, |phase| &phase.ended_by);

@@ -13,7 +13,7 @@ use std::fmt;
 /// The report on one run.
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
-    /// Where the time went.
+    /// How the time was spent.
     #[serde(flatten)]
     pub statistics: Statistics,
     /// What the run waited for, from its start to its end.

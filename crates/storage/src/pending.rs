@@ -1,7 +1,7 @@
 //! State that a writer shares with the writing thread and a compaction: the records that wait, and their positions.
 //!
 //! ```text
-//!   append ──▶ batch ──take──▶ the thread that writes ──▶ progress.durable ──▶ whoever holds answers back
+//!   append ──▶ batch ──take──▶ the writing thread ──▶ progress.durable ──▶ callers that hold answers back
 //! ```
 //! The lock is held for copying a record and for swapping two buffers, never during a write. In a batch every record follows its length:
 //! `length u32 | payload`, little-endian.

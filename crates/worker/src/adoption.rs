@@ -1,8 +1,8 @@
 //! Adoption: a worker outlives its process manager for a while, so that a successor can take the worker over.
 //!
 //! ```text
-//!   parent's pipe ends ─▶ waits on its socket ── somebody connects in time ──▶ that connection is the parent's pipe now
-//!                              └── nobody does ──▶ ends
+//!   parent's pipe ends ─▶ waits on its socket ── a successor connects in time ──▶ that connection replaces the parent's pipe
+//!                              └── none does ──▶ ends
 //! ```
 //! The process manager sets [`SOCKET_VARIABLE`] and [`GRACE_VARIABLE`] for workers of a template that says `adopt = true`; without them a
 //! worker ends with its parent.

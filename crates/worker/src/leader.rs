@@ -1,9 +1,9 @@
 //! Connects to a group of servers of which one leads and the others stand by: the connection goes to the leader, and moves with it.
 //!
 //! ```text
-//!   connect ── which of them says SERVING? ──▶ connection ◀── it says SERVING again ──┐
-//!      ▲                                        │    └── it says nothing, or NOT_SERVING ──▶ in doubt: the others are asked, too
-//!      └──────────── made anew ◀── broken ──────┴───────────── another one says SERVING ◀──┘
+//!   connect ── which server is SERVING? ─────▶ connection ◀── it is SERVING again ────┐
+//!      ▲                                        │    └── no answer, or NOT_SERVING ──▶ in doubt: the others are asked, too
+//!      └──────────── connect again ◀── broken ──┴───────────── another one is SERVING ◀──┘
 //! ```
 //! Servers are asked by gRPC health only: a standby answers NOT_SERVING. The user of the connection sees a change of the leader as a broken
 //! connection.

@@ -1,8 +1,8 @@
 //! The server of every daemon and worker: bind, add health and reflection, serve until a token is cancelled, drain with a hard deadline.
 //!
 //! ```text
-//!   serving ─ token cancelled ─▶ draining ─ no call under way, or the deadline ─▶ connections told to go away ─▶ over
-//!                                NOT_SERVING, new calls: UNAVAILABLE, when to come back
+//!   serving ─ token cancelled ─▶ draining ─ no call under way, or the deadline ─▶ GOAWAY on all connections ─▶ over
+//!                                NOT_SERVING, new calls: UNAVAILABLE with a retry delay
 //! ```
 
 use crate::access::RoleGate;

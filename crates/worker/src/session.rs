@@ -4,8 +4,8 @@
 //!
 //! ```text
 //! open ─→ not alive ─ ping answered ─→ alive ─ no answer for a TTL ─→ not alive
-//!                                      └─ answer says `created`, or another number ─→ alive, next generation
-//! not alive ─ answer says that it is known ─→ alive, the same generation: a manager that was suspended, or away, has kept it
+//!                                      └─ answer: `created`, or another number ─→ alive, next generation
+//! not alive ─ answer: known ─→ alive, the same generation: a manager that was suspended, or away, has kept it
 //! ```
 //! A session whose id belongs to another caller does not come back ([`Session::taken`]): its client has to use a session of another id.
 

@@ -1,9 +1,9 @@
 //! The condition of a daemon's core, as the core reports it: whether it takes its turns, whether it can do its work, and why it has ended.
 //!
 //! ```text
-//!   core ── beat, at every turn ──────────▶ systemd's watchdog (a core that hangs is silent)
+//!   core ── beat, at every turn ──────────▶ systemd's watchdog (a core that hangs does not beat)
 //!        ── unwell / well ────────────────▶ gRPC health, systemd's status
-//!        ── fail (panicked, fenced) ──────▶ serving ends at once, the process with a code of its own
+//!        ── fail (panicked, fenced) ──────▶ serving ends at once, the process exits with its own code
 //! ```
 //! Clones share one condition.
 

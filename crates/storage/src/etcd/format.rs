@@ -2,8 +2,8 @@
 //!
 //! ```text
 //!   meta      {"version":1, "store":N, "cluster":N, "generation":N, "accepted":N}
-//!             the log's number, etcd's own of the cluster, the generation (0; a copy's is the seconds since 1970; one more whenever an
-//!             older state is accepted), and behind which record one was accepted last
+//!             the log's number, etcd's cluster id, the generation (0; of a copy, the seconds since 1970; plus one whenever an
+//!             older state is accepted), and the record after which an older state was last accepted
 //!   leader    {"epoch":N, "holder":{…} or null, "draw":N}
 //!   head      {"position":N, "epoch":N, "step":N}
 //!   step      {"epoch":N, "step":N}

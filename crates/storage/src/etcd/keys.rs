@@ -1,17 +1,17 @@
 //! The keys in etcd, and helpers that build transactions of them.
 //!
 //! ```text
-//!   PREFIX/meta                       which log this is, and of which format
-//!   PREFIX/leader                     who leads; written when somebody takes the place, and when it is given up
-//!   PREFIX/alive                      written again and again by who leads
-//!   PREFIX/writable                   there as long as who leads can write `alive`
+//!   PREFIX/meta                       the log's identity and format version
+//!   PREFIX/leader                     the leader; written when the place is taken, and when it is given up
+//!   PREFIX/alive                      written regularly by the leader
+//!   PREFIX/writable                   exists as long as the leader can write `alive`
 //!   PREFIX/head                       the last record that counts
-//!   PREFIX/step                       how often a snapshot, or what it replaces, or one of the next two was changed
-//!   PREFIX/unfinished                 until a copy counts; says where its source was moved to, as `moved` does there, when all is there
-//!   PREFIX/moved                      where all of it was moved to
-//!   PREFIX/log/POSITION/PART          a frame of records, by the first of them
-//!   PREFIX/snapshot/current           which snapshot counts
-//!   PREFIX/snapshot/THROUGH/PART      a snapshot
+//!   PREFIX/step                       number of changes of a snapshot, of what it replaces, or of one of the next two keys
+//!   PREFIX/unfinished                 exists until a copy counts; in a complete copy, the same text as `moved` in its source
+//!   PREFIX/moved                      the place to which the log was moved
+//!   PREFIX/log/POSITION/PART          a part of a frame, by the position of its first record
+//!   PREFIX/snapshot/current           the snapshot that counts
+//!   PREFIX/snapshot/THROUGH/PART      a part of a snapshot
 //! ```
 //! Positions and parts have a fixed number of digits, so that the order of the keys is the order of positions and parts.
 

@@ -32,7 +32,7 @@ use std::time::{Duration, Instant};
 pub(super) const PATIENCE: Duration = Duration::from_secs(10);
 /// A transaction that takes longer than this is reported as stalled.
 const STALLED_AFTER: Duration = Duration::from_millis(500);
-/// If several callers wait for a transaction, the next one is delayed for them by this part of its duration …
+/// If several callers waited for a transaction, the next one is delayed for them by this part of its duration …
 const LINGER_SHARE: u32 = 8;
 /// … and by no more than this.
 const LONGEST_LINGER: Duration = Duration::from_millis(2);

@@ -1,12 +1,12 @@
 //! The names in a log's directory.
 //!
 //! ```text
-//!   writer.lock                         whose inode is locked by the writer
+//!   writer.lock                         locked by the writer
 //!   segment-00000000000000000001.log    by number
-//!   snapshot-00000000000000004711.snap  by the last position it stands for
-//!   unfinished-copy                     until a copy counts; says what the source's moved-to says, when all is there
-//!   moved-to                            says where all of it was moved to
-//!   *.tmp                               not finished; the next writer removes it
+//!   snapshot-00000000000000004711.snap  by the last position that it replaces
+//!   unfinished-copy                     exists until a copy counts; in a complete copy, the same text as moved-to in its source
+//!   moved-to                            the place to which the log was moved
+//!   *.tmp                               unfinished; the next writer removes it
 //! ```
 
 use crate::store::Position;

@@ -1,11 +1,11 @@
 //! Admission control of goals: which goals run, wait or are remembered on a server, and which requests are refused.
 //!
 //! ```text
-//! asked ─ known ────────────────────────────→ joined, or refused: another goal has its id, or its result is forgotten
-//!   ├─ no lease, another's, one that is over ──→ refused
-//!   ├─ the manager has not told of its lease ──→ waits for that, a second at the most
-//!   ├─ one that was told to stop still moves ──→ waits for its end; refused once that one is overdue
-//!   ├─ busy, too many ────────────────────────→ refused
+//! asked ─ known ────────────────────────────→ joined, or refused: another goal has its id, or its result was forgotten
+//!   ├─ no lease, another's, an ended one ──────→ refused
+//!   ├─ its lease is not confirmed yet ─────────→ waits for that, at most a second
+//!   ├─ a goal told to stop still runs ─────────→ waits for its end; refused when that goal is overdue
+//!   ├─ busy, too many goals ───────────────────→ refused
 //!   └→ new
 //! ```
 

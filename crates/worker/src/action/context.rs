@@ -111,7 +111,7 @@ pub enum CallFailure {
         #[source]
         source: CallError,
     },
-    /// The action ended otherwise than with success.
+    /// The action did not end with success.
     #[error("{action} was {outcome}: {reason}")]
     Outcome {
         /// The action that was called.
@@ -316,7 +316,7 @@ impl GoalContext {
     /// Calls an action of another provider whose resource this goal's lease holds, under that lease. Returns the outputs of the action.
     ///
     /// # Errors
-    /// [`CallFailure`], also where the action ends otherwise than with success.
+    /// [`CallFailure`], also if the action does not end with success.
     pub async fn call(
         &self,
         kind: &str,

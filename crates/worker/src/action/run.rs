@@ -1,9 +1,9 @@
 //! Runs one goal from its beginning to its end.
 //!
 //! ```text
-//! begun ─ the action returns ─────────────────→ result told, place free
-//!    └─ told to stop ─ it does not for a grace ─→ result told ─ the action returns ─→ place free
-//!                                                      └─ it does not for much longer ─→ the server is stuck
+//! begun ─ the action returns ─────────────────→ result sent, resource free
+//!    └─ told to stop ─ runs on after the grace ─→ result sent ─ the action returns ─→ resource free
+//!                                                      └─ runs on for much longer ─→ the server is stuck
 //! ```
 //! A goal keeps its resource until its action has returned, even if a result was sent earlier.
 

@@ -3,7 +3,7 @@
 //!
 //! ```text
 //!   listener ─ within the rate ─▶ queue ─▶ the server's runtime
-//!       └───── beyond ─▶ GOAWAY with the reason (not with TLS, where nothing can be said before a handshake) ─▶ closed
+//!       └───── beyond ─▶ GOAWAY with the reason (not with TLS, where nothing can be sent before a handshake) ─▶ closed
 //! ```
 
 use super::rates::Rates;

@@ -72,7 +72,7 @@ pub(crate) trait LeaseListener: Send + Sync {
     fn under_way(&self, resource: &str, lease: Option<(LeaseId, FencingToken)>) -> Vec<CancellationToken>;
 }
 
-/// The leases of a provider's resources, as far as the resource manager has told of them. A handle: clones share everything.
+/// The leases of a provider's resources, as far as the resource manager has reported them. A handle: clones share everything.
 #[derive(Clone)]
 pub struct LeaseWatch {
     shared: Arc<Shared>,

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //!             stop, hold                                          clear, go on
-//!  ready ───────────────────▶ held, stopped: brakes applied ◀───▶ latch removed ─▶ brakes let go ─▶ ready
+//!  ready ───────────────────▶ held, stopped: brakes applied ◀───▶ latch removed ─▶ brakes released ─▶ ready
 //!                              │  ▲                                      │               │
 //!                              └──┘ asked again, not confirmed           └─ stop, hold ──┴─▶ brakes applied again
 //! ```
