@@ -1,7 +1,8 @@
-//! The editor of annotations: one task file, shown with what is in force for its states, checked with a change in it, and changed.
+//! The editor of annotations: shows a task file with the annotations in force for its states, checks a proposed change, and writes it.
 //!
-//! It owns the file only while it writes: what a page has seen is known by a digest, and a text of another digest is not changed. What changes
-//! in the text, `ratn_model::load::edit` decides; how a text is checked and simulated, whoever starts the dashboard says.
+//! The file is locked only during a write: a page identifies the text that it has seen by a digest, and a text with another digest is not
+//! changed. `ratn_model::load::edit` makes the change in the text; whoever starts the dashboard supplies the functions that check and
+//! simulate a text.
 
 mod attributes;
 mod file;
@@ -26,26 +27,26 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::Semaphore;
 
-/// What a page sends has at most this many bytes …
+/// Maximum size in bytes of a request from a page …
 pub(crate) const MAX_BODY: usize = 64 * 1024;
-/// … and this many items of all keys.
+/// … and maximum number of items in it, all keys together.
 const MAX_ITEMS: usize = 1_000;
-/// A simulation that takes longer is ended.
+/// Time limit of a simulation.
 const SIMULATION: Duration = Duration::from_secs(2);
-/// Of longer changes the first lines are shown.
+/// Maximum number of lines shown of a change.
 const MAX_SHOWN_LINES: usize = 60;
-/// So many words of a kind are offered for completion.
+/// Maximum number of words of a kind offered for completion.
 const MAX_WORDS: usize = 500;
-/// So many words are offered for single places of predicates.
+/// Maximum number of words offered for single places of predicates.
 const MAX_PLACED: usize = 5_000;
-/// Keys of one value; all others have a list.
+/// Keys with a single value; all others have a list.
 const SINGLE: [&str; 7] = ["computes", "pia", "duration", "attempts", "deterministic", "routine", "exceptions"];
 
 type Kinds = dyn Fn() -> Vec<String> + Send + Sync;
 type Check = dyn Fn(&str) -> Result<Loaded, Vec<Diagnostic>> + Send + Sync;
 type Makespan = dyn Fn(&Program, &dyn Fn() -> bool) -> Result<f64, String> + Send + Sync;
 
-/// A task file whose annotations may be changed, and how its text is checked.
+/// A task file whose annotations may be changed, and the functions that check its text.
 #[derive(Clone)]
 pub struct Editing(Arc<Inner>);
 
@@ -55,9 +56,9 @@ struct Inner {
     check: Box<Check>,
     makespan: Box<Makespan>,
     writing: Mutex<()>,
-    /// One at a time.
+    /// Allows one simulation at a time.
     simulating: Arc<Semaphore>,
-    /// How many were asked for: an older one makes room for the newest.
+    /// Number of simulations asked for: the newest one supersedes older ones.
     asked: AtomicU64,
 }
 
@@ -68,8 +69,9 @@ impl std::fmt::Debug for Editing {
 }
 
 impl Editing {
-    /// Of this file. `kinds` says which kinds of resources are offered; `check` loads and checks a text as the file's; `makespan` says how many seconds a program
-    /// takes as a dataflow network, or why that cannot be said; it asks often whether it shall go on, and ends soon after it shall not.
+    /// An editor for this file. `kinds` returns the kinds of resources offered; `check` loads and checks a text as that of the file;
+    /// `makespan` returns the duration in seconds of a program as a dataflow network, or why it is unknown. It polls its second argument,
+    /// whether to go on, and ends soon after that returns false.
     pub fn of(
         file: PathBuf,
         kinds: impl Fn() -> Vec<String> + Send + Sync + 'static,
@@ -81,17 +83,17 @@ impl Editing {
         Editing(Arc::new(Inner { file, kinds, check, makespan, writing, simulating, asked: AtomicU64::new(0) }))
     }
 
-    /// The file, for people.
+    /// The file's path, for people.
     pub(crate) fn name(&self) -> String {
         self.0.file.display().to_string()
     }
 }
 
-/// What a page wants to have changed.
+/// A change that a page proposes.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Proposal {
-    /// Of the text that it has seen.
+    /// The digest of the text that the page has seen.
     digest: String,
     /// The path of the state.
     state: String,
@@ -99,46 +101,46 @@ pub(crate) struct Proposal {
     changes: Vec<Setting>,
 }
 
-/// What a state shall say under a key.
+/// The new value of a key of a state.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Setting {
     key: String,
-    /// Nothing: the key is not there any more.
+    /// `None`: the key is removed.
     items: Option<Vec<String>>,
 }
 
-/// Why something is not done.
+/// Why a request is not carried out.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum Problem {
-    /// The question cannot be understood.
+    /// The request is malformed.
     #[error("{0}")]
     Question(String),
-    /// The file is not as the page has seen it.
+    /// The file has changed since the page read it.
     #[error(
         "{file} has changed on the disk since it was read: read it again, then make the change anew; nothing was written"
     )]
     Changed {
-        /// Which.
+        /// The file.
         file: String,
     },
     /// The file cannot be read or written.
     #[error(transparent)]
     File(#[from] FileError),
-    /// The text cannot be changed so.
+    /// The text cannot be changed in this way.
     #[error(transparent)]
     Edit(#[from] EditError),
-    /// A value that is none.
+    /// A value is invalid.
     #[error("`{item}` of `{key}` is no value: {why}")]
     Value {
-        /// Of which key.
+        /// Its key.
         key: String,
-        /// Which.
+        /// The item.
         item: String,
-        /// What is wrong.
+        /// The reason.
         why: String,
     },
-    /// The file would be refused.
+    /// The changed file would be refused.
     #[error("with this change `ratn check` would refuse the file, and nothing was written: {first}")]
     Refused {
         /// The first error.
@@ -147,7 +149,7 @@ pub(crate) enum Problem {
 }
 
 impl Problem {
-    /// The key that it is of.
+    /// The key that the problem is about; empty for none.
     fn key(&self) -> String {
         match self {
             Problem::Edit(EditError::Unsafe { key, .. } | EditError::NoKey { key, .. })
@@ -158,7 +160,7 @@ impl Problem {
 }
 
 impl Proposal {
-    /// Reads what a page has sent.
+    /// Parses the request of a page.
     pub(crate) fn read(body: &[u8]) -> Result<Proposal, Problem> {
         let read: Proposal = serde_json::from_slice(body)
             .map_err(|error| Problem::Question(format!("this is no change of annotations: {error}")))?;
@@ -204,7 +206,7 @@ pub(crate) fn told(editing: &Editing) -> Result<wire::Annotations, Problem> {
     })
 }
 
-/// What changes would lead to. May read files; writes none.
+/// The effect of a change. May read files; writes none.
 pub(crate) fn proposed(editing: &Editing, proposal: &Proposal) -> Result<wire::Proposed, Problem> {
     let inner = &editing.0;
     let text = as_seen(editing, proposal)?;
@@ -236,7 +238,7 @@ pub(crate) fn proposed(editing: &Editing, proposal: &Proposal) -> Result<wire::P
     })
 }
 
-/// What changes would gain: two simulations, each of which is ended after [`SIMULATION`], when somebody asks for another one, and when this is
+/// The gain of a change: two simulations. Each is ended after [`SIMULATION`], when another gain is asked for, or when this future is
 /// dropped.
 pub(crate) async fn gained(editing: &Editing, proposal: Proposal) -> Result<wire::Gained, Problem> {
     let without = |obstacle: &str| Ok(wire::Gained { obstacle: obstacle.to_owned(), ..wire::Gained::default() });
@@ -248,7 +250,7 @@ pub(crate) async fn gained(editing: &Editing, proposal: Proposal) -> Result<wire
     let asker = Arc::new(());
     let waits = Arc::downgrade(&asker);
     let simulated = tokio::task::spawn_blocking(move || {
-        // As long as it goes on no other one begins.
+        // Held to the end, so that no other simulation begins meanwhile.
         let _place = place;
         let text = as_seen(&editing, &proposal)?;
         let new = changed(&text, &proposal)?;
@@ -277,10 +279,10 @@ pub(crate) async fn gained(editing: &Editing, proposal: Proposal) -> Result<wire
     gained
 }
 
-/// Writes the changes into the file. May read and write files.
+/// Writes a change into the file. May read and write files.
 pub(crate) fn saved(editing: &Editing, proposal: &Proposal) -> Result<wire::Told, Problem> {
     let inner = &editing.0;
-    // What a panic left is whole: the file is replaced at once.
+    // A panic leaves the file intact: it is replaced atomically.
     let _writing = inner.writing.lock().unwrap_or_else(PoisonError::into_inner);
     let text = as_seen(editing, proposal)?;
     let new = changed(&text, proposal)?;
@@ -318,7 +320,7 @@ fn changed(text: &str, proposal: &Proposal) -> Result<String, Problem> {
     Ok(new)
 }
 
-/// What items say, as the file has it.
+/// The value for the file from the items of a page.
 fn value(key: &str, items: &[String]) -> Result<Document, Problem> {
     let read =
         |text: &String| item(text).map_err(|why| Problem::Value { key: key.to_owned(), item: text.clone(), why });
@@ -337,10 +339,10 @@ fn value(key: &str, items: &[String]) -> Result<Document, Problem> {
     }
 }
 
-/// What somebody has typed: in brackets or quotes, a number or a boolean as YAML has it, else a text as it stands there.
+/// Parses an item that a user has typed: in brackets or quotes, a number or a boolean as YAML; anything else as plain text.
 fn item(text: &str) -> Result<Document, String> {
     let text = text.trim();
-    // A few bytes of them are millions of values.
+    // A few bytes of anchors could expand to millions of values.
     if edit::has_anchor(text) {
         return Err("an anchor or an alias (`&`, `*`) stands in it: write out what it stands for".to_owned());
     }
@@ -352,7 +354,7 @@ fn item(text: &str) -> Result<Document, String> {
         return as_yaml();
     }
     match as_yaml() {
-        // In YAML a comment would begin at `#`, which nobody types here.
+        // In YAML a comment begins at `#`; here it is part of the text.
         Ok(read @ (Document::Bool(_) | Document::Int(_) | Document::Float(_) | Document::Null))
             if !text.is_empty() && !text.contains('#') =>
         {
@@ -363,7 +365,7 @@ fn item(text: &str) -> Result<Document, String> {
     }
 }
 
-/// As somebody would type it.
+/// An item in the form in which a user would type it.
 fn typed(item: &Document) -> String {
     match item {
         Document::Text(text) if self::item(text).as_ref() == Ok(item) => text.clone(),
@@ -393,7 +395,8 @@ fn state(one: &Written, in_force: Vec<wire::InForceLine>) -> wire::AnnotatedStat
     }
 }
 
-/// What is in force for the states of the file itself. Where one is tried again it has another path in the program, and it is known by its place.
+/// The annotations in force for the states of the file itself. A state with `retry` has another path in the program, so states are
+/// identified by their location.
 fn by_place(program: Option<&Program>, all: &[Written]) -> BTreeMap<Location, Vec<wire::InForceLine>> {
     let Some(program) = program else { return BTreeMap::new() };
     let libraries = libraries(all);
@@ -419,12 +422,12 @@ fn said(told: &InForce) -> Vec<wire::InForceLine> {
     told.lines.iter().map(line).collect()
 }
 
-/// What paths of states of libraries begin with.
+/// The path prefixes of states of libraries.
 fn libraries(all: &[Written]) -> Vec<String> {
     all.iter().filter(|one| one.form.starts_with("library")).map(|one| format!("{}/", one.path)).collect()
 }
 
-/// Puts the states of libraries behind those that use them.
+/// Inserts the states of libraries after those that use them.
 fn of_libraries(program: &Program, written: &[Written], states: &mut Vec<wire::AnnotatedState>) {
     let told: BTreeMap<String, InForce> = in_force(program).into_iter().map(|one| (one.state.clone(), one)).collect();
     for library in libraries(written) {
@@ -444,23 +447,23 @@ fn of_libraries(program: &Program, written: &[Written], states: &mut Vec<wire::A
     }
 }
 
-/// What can be completed to.
+/// Words offered for completion.
 #[derive(Debug, Default)]
 struct Words {
-    /// Of the ontology, and those that the file uses, as `at(?)`.
+    /// Predicates of the ontology, and those that the file uses, as `at(?)`.
     predicates: Vec<String>,
-    /// Of the ontology, and those that the file uses.
+    /// Individuals of the ontology, and those that the file uses.
     entities: Vec<String>,
-    /// Of predicates for whose places something else than all individuals can stand.
+    /// Predicates with places where something else than any individual is offered.
     places: Vec<wire::Places>,
 }
 
 /// A place of a predicate.
 #[derive(Debug, Default)]
 struct Place<'p> {
-    /// What may stand there: nothing is known without an ontology.
+    /// The domain that the ontology gives it; `None` without an ontology.
     domain: Option<&'p Domain>,
-    /// The variables that the file has there: `$box.id`.
+    /// The variables that the file uses there: `$box.id`.
     variables: BTreeSet<String>,
 }
 
@@ -510,7 +513,7 @@ fn words(program: Option<&Program>) -> Words {
             continue;
         }
         let offered: Vec<Vec<String>> = known.iter().map(|place| place.offered(program, &entities)).collect();
-        // Of a predicate that is left out, all individuals are offered.
+        // If the limit leaves a predicate out, all individuals are offered for it.
         let Some(rest) = left.checked_sub(offered.iter().map(Vec::len).sum()) else { continue };
         left = rest;
         places.push(wire::Places { predicate: with_places(name, *arity), offered });
@@ -520,7 +523,7 @@ fn words(program: Option<&Program>) -> Words {
 }
 
 impl Place<'_> {
-    /// The variables first: they are what the file has there.
+    /// Variables first, because the file uses them there.
     fn offered(&self, program: &Program, entities: &[String]) -> Vec<String> {
         let fits = |one: &&String| match (self.domain, &program.ontology) {
             (Some(Domain::Class(class)), Some(ontology)) => ontology.is_a(one, class),
@@ -531,12 +534,12 @@ impl Place<'_> {
     }
 }
 
-/// As pages know a predicate: `on(?, ?)`.
+/// A predicate in the notation of the pages: `on(?, ?)`.
 fn with_places(name: &str, arity: usize) -> String {
     format!("{name}({})", vec!["?"; arity].join(", "))
 }
 
-/// A variable or a field of one, as `$box.id`.
+/// A variable or a field of one: `$box.id`.
 fn is_variable(argument: &Expr) -> bool {
     match argument {
         Expr::Variable(_) => true,
@@ -555,7 +558,7 @@ fn changed_facts<'e>(effects: &'e [EffectExpr], found: &mut Vec<&'e FactExpr>) {
     }
 }
 
-/// An argument that is a name, as `cup`.
+/// An argument that is a plain name: `cup`.
 fn individual(argument: &Expr) -> Option<&str> {
     let Expr::Literal(Value::String(name)) = argument else { return None };
     let is_word = |name: &str| name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
@@ -575,7 +578,7 @@ fn finding(written: &[Written], one: &Diagnostic) -> wire::Finding {
     }
 }
 
-/// The lines that differ, with the number of the first one.
+/// The lines that differ, and the number of the first one.
 fn difference(old: &str, new: &str) -> (u32, Vec<String>, Vec<String>) {
     let (old, new): (Vec<&str>, Vec<&str>) = (old.lines().collect(), new.lines().collect());
     let most = old.len().min(new.len());

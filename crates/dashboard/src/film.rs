@@ -1,7 +1,7 @@
-//! What of a run can be seen in the cell, as its log tells it: where joints go when, where the base stands, which objects are where.
+//! The visible part of a run from its log: motions of joints, the pose of the base, and the objects.
 //!
-//! It knows no robot: which joints those of an arm or a head are, is said when it is told ([`crate::robot`]). Bounded: of the tracks those
-//! are kept that say where something is now, and the last ones before. Pure: it takes lines.
+//! It knows no robot: [`crate::robot`] later maps the joints of an arm or a head. Memory is bounded: tracks with the present positions are
+//! kept, and the latest earlier ones. Pure: it takes lines.
 
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
 use ratn_model::fact::{Change as Written, FactKey, Term};
@@ -13,44 +13,44 @@ use ratn_report::motions::{Change, Motions, Way, thinned};
 use ratn_world::scene::{BASE, Scene};
 use std::collections::{BTreeSet, VecDeque};
 
-/// Tracks that are kept.
+/// Maximum number of tracks kept.
 const MOST_TRACKS: usize = 96;
-/// Points of a track; of a trajectory with more some are left out.
+/// Maximum number of points of a track; a longer trajectory is thinned.
 const MOST_POINTS: usize = 600;
-/// Kinds of resources, as the standard catalogue has them.
+/// Kinds of resources in the standard catalogue.
 const ARM_KIND: &str = "Arm";
 const BASE_KIND: &str = "Base";
-/// Joints of a track; one with more is not kept.
+/// Maximum number of joints of a track; a track with more is not kept.
 pub(crate) const MOST_JOINTS: usize = 64;
-/// Parts that are remembered; of more the first.
+/// Maximum number of parts remembered.
 const MOST_PARTS: usize = 128;
 
-/// What can be seen.
+/// The visible part of a run.
 #[derive(Debug, Default)]
 pub(crate) struct Film {
     motions: Motions,
     believed: Believed,
-    /// How many changes there were, and at which one the world changed last.
+    /// Number of changes so far, and the number of the last one that changed the world.
     version: u64,
     world_changed: u64,
     tracks: VecDeque<Track>,
-    /// What was moved so far, with how many positions: also by tracks that are not kept any more.
+    /// The parts that were moved so far, each with its number of positions; also those of dropped tracks.
     parts: BTreeSet<(Part, usize)>,
-    /// Tracks of too many joints were left out.
+    /// Whether tracks were dropped because of too many joints.
     leaves_out: bool,
-    /// Tracks so far.
+    /// Number of tracks so far.
     numbers: u64,
     base: Option<Pose>,
-    /// Whether the system of the run has a base that drives, where the log tells what it has for an arm.
+    /// Whether the system of the run has a base that drives; known if the log tells that it has an arm.
     drives: Option<bool>,
 }
 
-/// Which joints.
+/// A group of joints.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Part {
-    /// These, by name.
+    /// Joints with these names.
     Named(Vec<String>),
-    /// All of an arm, which is named where there are several.
+    /// All joints of an arm; the arm has a name if there are several.
     Arm(Option<String>),
     /// Pan and tilt.
     Head,
@@ -60,28 +60,28 @@ pub(crate) enum Part {
     Base,
 }
 
-/// Where some joints are, or go.
+/// Positions or a motion of some joints.
 #[derive(Debug)]
 pub(crate) struct Track {
     /// Its number.
     pub(crate) id: u64,
-    /// The instance that moves them, while and after it does.
+    /// The instance that moves them, also after the motion.
     pub(crate) instance: Option<InstanceId>,
-    /// Which joints.
+    /// The joints.
     pub(crate) part: Part,
-    /// When it begins.
+    /// Start.
     pub(crate) from_s: f64,
-    /// When it was over.
+    /// End, if it is over.
     pub(crate) until_s: Option<f64>,
-    /// Its times are what is expected.
+    /// Whether its times are estimates.
     pub(crate) estimated: bool,
-    /// In order; where the first one is not at 0, it begins where the joints are.
+    /// In order of time; if the first point is not at 0, the track begins at the present positions.
     pub(crate) points: Vec<TrajectoryPoint>,
     changed: u64,
 }
 
 impl Film {
-    /// Takes the next line.
+    /// Applies the next line.
     pub(crate) fn apply(&mut self, line: &LogLine) {
         let at_s = line.at.seconds();
         if let LogEntry::Event(Event::Started { capacity, .. }) = &line.entry
@@ -97,7 +97,7 @@ impl Film {
                 self.stands(at_s, Part::Base, &ratn_motion::robot::on_floor(&base));
             }
         }
-        // What begins and ends is taken apart first: both borrow.
+        // Begin and end are handled separately, because both borrow `self`.
         let mut begun = None;
         match self.motions.follow(line) {
             Some(Change::Begins(instance, motion)) => begun = track(instance, motion),
@@ -128,12 +128,12 @@ impl Film {
         }
     }
 
-    /// Whether the robot of the run has a base that drives; none where the log does not tell.
+    /// Whether the robot of the run has a base that drives; `None` if unknown.
     pub(crate) fn drives(&self) -> Option<bool> {
         self.drives
     }
 
-    /// Up to which change this is.
+    /// The number of the last change.
     pub(crate) fn version(&self) -> u64 {
         self.version
     }
@@ -143,27 +143,27 @@ impl Film {
         self.tracks.iter()
     }
 
-    /// What was moved so far, each with how many positions.
+    /// The parts moved so far, each with its number of positions.
     pub(crate) fn parts(&self) -> impl Iterator<Item = &(Part, usize)> {
         self.parts.iter()
     }
 
-    /// Whether there were tracks of more than [`MOST_JOINTS`] joints, which are not kept.
+    /// Whether there were tracks with more than [`MOST_JOINTS`] joints, which are not kept.
     pub(crate) fn leaves_out(&self) -> bool {
         self.leaves_out
     }
 
-    /// The tracks that are new, or otherwise than at a version.
+    /// The tracks that are new or have changed since a version.
     pub(crate) fn since(&self, version: u64) -> impl Iterator<Item = &Track> {
         self.tracks.iter().filter(move |track| track.changed > version)
     }
 
-    /// The scene, if it is otherwise than at a version, or nothing was known. An inner none: no scene can be made of the facts.
+    /// The scene, if it has changed since a version, or if the version is 0. An inner `None`: the facts yield no scene.
     pub(crate) fn scene(&self, version: u64) -> Option<Option<Scene>> {
         (version == 0 || self.world_changed > version).then(|| self.believed.scene())
     }
 
-    /// Where the base was last said to be.
+    /// The last reported pose of the base.
     pub(crate) fn base(&self) -> Pose {
         self.base.unwrap_or(Pose::IDENTITY)
     }
@@ -198,7 +198,7 @@ impl Film {
         }
         self.numbers += 1;
         if self.tracks.len() >= MOST_TRACKS {
-            // What a later one of the same joints has taken over is of interest least.
+            // A track that is over and whose joints are in a later track is the least useful one.
             let is_over = |index: usize| {
                 let one = &self.tracks[index];
                 one.until_s.is_some() && self.tracks.iter().skip(index + 1).any(|later| later.part == one.part)
@@ -225,7 +225,7 @@ impl Default for Track {
     }
 }
 
-/// Of a motion; none of one to a posture of which nobody knows how long it takes: it is there when it has ended.
+/// The track of a motion; `None` for a motion to a posture of unknown duration: its end is shown instead.
 fn track(instance: InstanceId, motion: &ratn_report::motions::Motion) -> Option<Track> {
     let (part, points, estimated) = match &motion.way {
         Way::Along(trajectory) => {
@@ -241,7 +241,7 @@ fn track(instance: InstanceId, motion: &ratn_report::motions::Motion) -> Option<
     Some(Track { instance: Some(instance), part, from_s: motion.from_s, points, estimated, ..Track::default() })
 }
 
-/// Where a line says that the base stands.
+/// The pose of the base in a line, if any.
 fn base(line: &LogLine) -> Option<Pose> {
     let is_base = |key: &FactKey| {
         key.predicate == "at" && matches!(key.arguments.as_slice(), [Term::Name(name)] if name.as_str() == BASE)
@@ -276,7 +276,7 @@ mod tests {
         film
     }
 
-    /// A motion of one joint from second `id` on, for half a second.
+    /// A motion of one joint, from second `id` on, for half a second.
     fn motion(id: u64) -> [String; 2] {
         let (at, end) = (id * 1_000_000_000, id * 1_000_000_000 + 500_000_000);
         [

@@ -1,7 +1,7 @@
-//! A log read up to a moment: the run, its world, and what has changed since somebody last asked.
+//! A log read up to a moment: the run, its world, and the changes since a page last asked.
 //!
-//! It reads a bounded part of the file at a time and keeps a bounded number of instances, so that neither a long log nor a run without
-//! end costs more than a short one. It does not decide where to begin to read (`logs.rs`) nor how it is told (`tell.rs`).
+//! It reads a bounded part of the file at a time and keeps a bounded number of instances, so that neither a long log nor an endless run
+//! costs more than a short one. `logs.rs` decides where reading begins, `tell.rs` makes the answers.
 
 use crate::film::Film;
 use crate::world::World;
@@ -14,56 +14,56 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::Path;
 use std::sync::Arc;
 
-/// Instances that have left the window and are still shown.
+/// Number of instances kept after they have left the window.
 pub(crate) const KEPT: usize = 12_000;
-/// So many that are kept no more are told of one by one; who has not asked for longer is told everything anew.
+/// Number of dropped instances that are reported one by one; a page that has not asked for longer gets everything anew.
 const MOST_GONE: usize = 4 * KEPT;
 
 /// A log, read up to a moment.
 #[derive(Debug)]
 pub(crate) struct Fold {
-    /// Which fold it is: no two have the same.
+    /// The number of this fold, which is unique.
     pub(crate) epoch: u64,
-    /// From which moment on everything was read.
+    /// Everything from this moment on was read.
     pub(crate) from_s: f64,
     /// The run.
     pub(crate) run: Timeline,
     /// Its world.
     pub(crate) world: World,
-    /// What of it can be seen in the cell.
+    /// The visible part of the run.
     pub(crate) film: Film,
-    /// Why it cannot be read on; empty where it can.
+    /// Why the log cannot be read further; empty if it can.
     pub(crate) problem: String,
-    /// The digest of the texts of its task.
+    /// The digest of the task's files.
     pub(crate) digest: String,
-    /// The byte and the line behind what was read.
+    /// Offset and line number after what was read.
     position: (u64, usize),
-    /// How many changes there were.
+    /// Number of changes so far.
     version: u64,
     changed_at: BTreeMap<InstanceId, u64>,
     changes: BTreeSet<(u64, InstanceId)>,
     gone: VecDeque<(u64, InstanceId)>,
-    /// Everything that went before this change is not told of any more.
+    /// Changes up to this one are not reported any more.
     forgotten: u64,
     edges: BTreeMap<InstanceId, BTreeSet<(InstanceId, Bond)>>,
     by_path: BTreeMap<Arc<str>, BTreeSet<InstanceId>>,
 }
 
-/// Why an instance depended on another.
+/// Why an instance depended on another one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Bond {
-    /// It began when the other had a result.
+    /// It began when the other one had a result.
     Data,
-    /// Its projection shows what the other writes.
+    /// Its projection shows an effect of the other one.
     World,
-    /// The other held what it wanted.
+    /// The other one held a resource that it wanted.
     Resource,
-    /// The other decided whether it is needed.
+    /// The other one decided whether it is needed.
     Condition,
 }
 
 impl Bond {
-    /// As the pages know it.
+    /// The name in the pages' notation.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Bond::Data => "data",
@@ -74,26 +74,26 @@ impl Bond {
     }
 }
 
-/// What is told to somebody who knows an earlier version.
+/// The changes since a version.
 #[derive(Debug)]
 pub(crate) struct News {
-    /// Nothing of what was known counts.
+    /// Nothing of what was known before is valid.
     pub(crate) fresh: bool,
-    /// Up to which version this tells.
+    /// The version that this describes.
     pub(crate) version: u64,
-    /// There is more.
+    /// There are more changes.
     pub(crate) more: bool,
-    /// Instances that are new or otherwise.
+    /// Instances that are new or have changed.
     pub(crate) changed: Vec<InstanceId>,
-    /// Instances that are kept no more.
+    /// Instances that were dropped.
     pub(crate) gone: Vec<InstanceId>,
 }
 
 impl Fold {
-    /// Of a log from a byte on, where a line begins, which was at `from`. Of the lines before only the first is read.
+    /// Begins to read a log at an offset where a line begins, and with that line's time. Of the earlier lines only the first is read.
     ///
     /// # Errors
-    /// Where the log cannot be read.
+    /// The log cannot be read.
     pub(crate) fn begin(epoch: u64, path: &Path, (byte, from): (u64, Timestamp)) -> Result<Fold, LogError> {
         let mut fold = Fold {
             epoch,
@@ -123,16 +123,16 @@ impl Fold {
         Ok(fold)
     }
 
-    /// Reads what was up to a moment, that moment included, but no more than so many bytes at a time. Whether it is there.
+    /// Reads up to a moment, inclusive, but at most about `most_bytes` per call. Returns whether the moment was reached.
     ///
     /// # Errors
-    /// Where the log cannot be read.
+    /// The log cannot be read.
     pub(crate) fn read(&mut self, path: &Path, until: Timestamp, most_bytes: u64) -> Result<bool, LogError> {
         let mut lines = Lines::behind(path, self.position.0, self.position.1)?;
         let stop = self.position.0.saturating_add(most_bytes);
         while let Some(line) = lines.next() {
             let line = match line {
-                // What was before it is shown, and that it is wrong is said.
+                // What comes before the wrong line is shown, with the error.
                 Err(error @ LogError::Foreign { .. }) if self.position.0 > 0 => {
                     let from = if self.from_s > 0.0 {
                         format!(", counted from {:.1} s on", self.from_s)
@@ -171,17 +171,17 @@ impl Fold {
         Ok(true)
     }
 
-    /// How many bytes were read, those before the first line that was included.
+    /// Offset up to which the log was read.
     pub(crate) fn position(&self) -> u64 {
         self.position.0
     }
 
-    /// On whom an instance depended, as far as the log tells.
+    /// The instances on which an instance depended, as far as the log tells.
     pub(crate) fn edges(&self, id: InstanceId) -> impl Iterator<Item = (InstanceId, Bond)> {
         self.edges.get(&id).into_iter().flatten().copied()
     }
 
-    /// What somebody is told who knows this version, at most so many instances of it.
+    /// The changes since a version, with at most `most` instances.
     pub(crate) fn since(&self, version: u64, most: usize) -> News {
         let fresh = version == 0 || version < self.forgotten || version > self.version;
         let known = if fresh { 0 } else { version };
@@ -226,11 +226,11 @@ impl Fold {
         }
     }
 
-    /// Its projection shows what these write.
+    /// Records that an instance's projection shows effects of these writers.
     fn projected(&mut self, id: InstanceId, writers: &[Arc<str>]) {
         let distinct: BTreeSet<&str> = writers.iter().map(|path| &**path).collect();
         for path in distinct {
-            // Who is not kept any more has become real: it is the root's.
+            // A writer that is not kept any more has retired: its effects are in the root.
             let writer = self.by_path.get(path).and_then(|of_path| of_path.range(..id).next_back());
             if let Some(writer) = writer {
                 self.edges.entry(id).or_default().insert((*writer, Bond::World));
@@ -239,8 +239,8 @@ impl Fold {
     }
 }
 
-/// What the stages and waits of an instance say of others. The latest stage and wait are enough: earlier ones were looked at when they
-/// were the latest.
+/// The dependencies that follow from the stages and waits of an instance. The latest stage and wait are enough: earlier ones were examined
+/// when they were the latest.
 fn bonds(instance: &Instance, run: &Timeline) -> Vec<(InstanceId, Bond)> {
     let mut found = Vec::new();
     let goes_on = !matches!(instance.stage, Stage::Squashed | Stage::Waiting);

@@ -1,17 +1,17 @@
-//! Who is answered: only pages that this program itself has served, on this machine, with the token that its user was given.
+//! Access control: only pages that this program itself has served, on this machine, with the token of its user, get answers.
 //!
-//! A page of somebody else's cannot ask: it does not know the token, its `Origin` is another, and a name that leads here by the DNS of
-//! others (rebinding) is not one of this machine's. Pure.
+//! A foreign page cannot ask: it does not know the token, has another `Origin`, and a host name that was rebound to this machine by DNS is
+//! not one of the accepted names. Pure.
 
 use hyper::header::{AUTHORIZATION, HOST, HeaderMap, HeaderValue, ORIGIN};
 use ring::rand::{SecureRandom, SystemRandom};
 
 const TOKEN_BYTES: usize = 24;
-/// As a browser may name this machine.
+/// The names by which a browser may address this machine.
 const NAMES: [&str; 3] = ["127.0.0.1", "localhost", "[::1]"];
 const SCHEME: &str = "Bearer ";
 
-/// What every answer says to the browser: run nothing that is not ours, send nothing elsewhere, be in nobody's frame, keep nothing.
+/// Headers of every answer: the browser may run nothing foreign, send nothing elsewhere, show no page in a frame, and store nothing.
 pub(crate) const HEADERS: [(&str, &str); 7] = [
     (
         "content-security-policy",
@@ -26,19 +26,19 @@ pub(crate) const HEADERS: [(&str, &str); 7] = [
     ("permissions-policy", "camera=(), microphone=(), geolocation=()"),
 ];
 
-/// What its user was given. No message of this crate has it.
+/// The secret token of the user. No message of this crate contains it.
 pub(crate) struct Token(String);
 
-/// Why somebody is not answered.
+/// Why a request is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum Refused {
-    /// The page was asked for by a name that is not this machine's.
+    /// The request's host name is not one of this machine's.
     #[error("this is served as 127.0.0.1 or localhost only")]
     Host,
     /// Another page asks.
     #[error("pages of others are not answered")]
     Origin,
-    /// The token is another one, or none.
+    /// The token is wrong or missing.
     #[error("the token is not the one of this dashboard: open the address that `ratn dashboard` printed")]
     Token,
 }
@@ -50,26 +50,26 @@ impl std::fmt::Debug for Token {
 }
 
 impl Token {
-    /// A new one; `None` where the system gives no random bytes.
+    /// A new token; `None` if the system provides no random bytes.
     pub(crate) fn random() -> Option<Token> {
         let mut bytes = [0; TOKEN_BYTES];
         SystemRandom::new().fill(&mut bytes).ok()?;
         Some(Token(bytes.iter().map(|byte| format!("{byte:02x}")).collect()))
     }
 
-    /// For the address that the user opens.
+    /// The text, for the address that the user opens.
     pub(crate) fn text(&self) -> &str {
         &self.0
     }
 
-    /// In a time that does not depend on where they differ.
+    /// Compares in constant time.
     fn is(&self, other: &[u8]) -> bool {
         let own = self.0.as_bytes();
         own.len() == other.len() && own.iter().zip(other).fold(0, |all, (a, b)| all | (a ^ b)) == 0
     }
 }
 
-/// Whether the pages themselves, in which nothing of anybody is, may be had.
+/// Checks access to the pages themselves, which contain no data. Returns the host.
 pub(crate) fn asks_here(headers: &HeaderMap) -> Result<&str, Refused> {
     let host = only(headers, &HOST).and_then(|host| host.to_str().ok()).ok_or(Refused::Host)?;
     let name = match host.rsplit_once(':') {
@@ -88,7 +88,7 @@ pub(crate) fn asks_here(headers: &HeaderMap) -> Result<&str, Refused> {
     Ok(host)
 }
 
-/// Whether runs and systems may be looked at.
+/// Checks access to runs and systems.
 pub(crate) fn may_look(headers: &HeaderMap, token: &Token) -> Result<(), Refused> {
     asks_here(headers)?;
     let shown = only(headers, &AUTHORIZATION).map(HeaderValue::as_bytes);
@@ -96,7 +96,7 @@ pub(crate) fn may_look(headers: &HeaderMap, token: &Token) -> Result<(), Refused
     if token.is(shown) { Ok(()) } else { Err(Refused::Token) }
 }
 
-/// The value of a header that is there once.
+/// The value of a header that occurs exactly once.
 fn only<'h>(headers: &'h HeaderMap, name: &hyper::header::HeaderName) -> Option<&'h HeaderValue> {
     let mut all = headers.get_all(name).iter();
     let first = all.next()?;

@@ -1,10 +1,10 @@
 //! The dashboard: runs and a system as pages in a browser on this machine.
 //!
-//! It owns an HTTP server on loopback, the folds of the logs that pages look at, and the pages themselves, which are built from `web/`
-//! and travel in the program. It decides nothing of a run: what it shows is the event log's (`ratn-report`) and the daemons' word, and
-//! what it tells a run goes over the run's control socket, if its user allowed that.
+//! The crate owns an HTTP server on loopback, the folds of the logs that pages show, and the pages themselves, which are built from `web/`
+//! and embedded in the program. It decides nothing in a run: it shows the event log (`ratn-report`) and the daemons' answers, and its
+//! commands to a run go over the run's control socket, if its user allowed that.
 //!
-//! Pages ask, a few times a second while somebody looks at them, for what has changed; nothing is pushed, so nothing queues up.
+//! Pages poll for changes, a few times per second while they are visible; nothing is pushed, so nothing queues up.
 
 mod annotations;
 mod film;

@@ -1,7 +1,7 @@
-//! The logs that are looked at: which there are, how far each was read, and the moments at which pages replay them.
+//! The logs that pages show: which exist, how far each was read, and the moments at which pages replay them.
 //!
-//! Nothing is read unless a page asks, and all pages that look at the same share one fold, so a page that nobody looks at costs a run
-//! nothing. A long log is not read from its start: enough of it before the moment that is shown is ([`Parts`]).
+//! Nothing is read unless a page asks, and all pages that show the same share one fold, so a hidden page costs a run nothing. A long log is
+//! not read from its start, but from far enough before the shown moment ([`Parts`]).
 
 use crate::fold::{Bond, Fold};
 use crate::{robot, tell, wire};
@@ -13,40 +13,40 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// So many logs of the command line are looked at,
+/// Maximum number of logs from the command line,
 pub const MAX_LOGS: usize = 16;
-/// and beside them so many that runs write meanwhile: as many as there may be runs.
+/// and of further logs that runs write: as many as there may be runs.
 const MAX_LOGS_OF_RUNS: usize = 64;
-/// So much of a log is read before the moment that is shown; a shorter log is read from its start.
+/// Number of bytes read before the shown moment; a shorter log is read from its start.
 const BEFORE_BYTES: u64 = 16 << 20;
-/// So much is read for one answer.
+/// Maximum number of bytes read for one answer.
 const BUDGET_BYTES: u64 = 4 << 20;
-/// Replays that are kept, so that each goes on where it was. Of more the one that was not asked for longest begins anew.
+/// Maximum number of replays kept, so that each can continue. Beyond it, the one unused for the longest time starts anew.
 const MAX_REPLAYS: usize = 4;
-/// Instances in one answer.
+/// Maximum number of instances in one answer.
 const MOST_INSTANCES: usize = 4_000;
-/// A log is not looked at more often.
+/// Minimum interval between two looks at a log.
 const LOOK_INTERVAL: Duration = Duration::from_millis(50);
-/// It has not been heard of for so long: no run writes it.
+/// If a run has not reported itself for this long, its log counts as complete.
 const HEARD_WITHIN: Duration = Duration::from_secs(3);
 
-/// What a page knows of a log already, and which moment it shows.
+/// What a page already knows of a log, and the moment it shows.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Asked {
-    /// The moment in seconds; none for the newest.
+    /// The moment in seconds; `None` for the newest.
     pub(crate) at_s: Option<f64>,
-    /// Of which fold it knows something.
+    /// The fold that it knows.
     pub(crate) epoch: u64,
-    /// Up to which version.
+    /// The version that it knows.
     pub(crate) version: u64,
-    /// The instance of which it wants to know in any case why it waits.
+    /// An instance for which it wants the reason of waiting in any case.
     pub(crate) about: Option<InstanceId>,
 }
 
-/// Why a log is not told of.
+/// Why a log cannot be shown.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum NotTold {
-    /// There is none of this number.
+    /// There is no log of this number.
     #[error("there is no log {0}: it was given up for a newer one, or never there")]
     Unknown(u64),
     /// It cannot be read.
@@ -54,7 +54,7 @@ pub(crate) enum NotTold {
     Log(#[from] LogError),
 }
 
-/// All of them.
+/// All logs.
 #[derive(Debug, Default)]
 pub(crate) struct Logs {
     all: Mutex<All>,
@@ -63,7 +63,7 @@ pub(crate) struct Logs {
 #[derive(Debug, Default)]
 struct All {
     logs: Vec<Followed>,
-    /// Numbers of logs and folds, each given once.
+    /// The last number given to a log or fold; numbers are unique.
     numbers: u64,
     replays: Vec<Replay>,
 }
@@ -73,16 +73,16 @@ struct All {
 struct Followed {
     id: u64,
     path: PathBuf,
-    /// It was named by the user: it is not given up.
+    /// Named by the user: never dropped.
     named: bool,
     parts: Option<Parts>,
     live: Option<Fold>,
     looked: Option<Instant>,
-    /// What its run last said of itself.
+    /// The last status reported by its run.
     heard: Option<(Instant, RunStatus)>,
 }
 
-/// A log at a moment.
+/// A replay: a log at a moment.
 #[derive(Debug)]
 struct Replay {
     log: u64,
@@ -91,7 +91,7 @@ struct Replay {
 }
 
 impl Logs {
-    /// The logs of the command line.
+    /// The logs from the command line.
     pub(crate) fn of(paths: &[PathBuf]) -> Logs {
         let mut all = All::default();
         for path in paths {
@@ -100,13 +100,13 @@ impl Logs {
         Logs { all: Mutex::new(all) }
     }
 
-    /// These runs say what they are doing, and no others are under way; their logs are among them from now on.
+    /// Takes the statuses of all runs under way, and adds their logs.
     pub(crate) fn hear(&self, statuses: Vec<RunStatus>) {
         let mut all = self.lock();
         all.logs.iter_mut().for_each(|one| one.heard = None);
         for status in statuses {
             let path = std::fs::canonicalize(&status.log).unwrap_or_else(|_| status.log.clone());
-            // A pipe is no log: opening it would wait for whoever writes it.
+            // A pipe is not a log: opening it would wait for its writer.
             if std::fs::metadata(&path).is_ok_and(|is| !is.is_file()) {
                 continue;
             }
@@ -118,7 +118,7 @@ impl Logs {
         }
     }
 
-    /// What there is.
+    /// The list of logs.
     pub(crate) fn told(&self) -> Vec<wire::Log> {
         let tell = |one: &Followed| wire::Log {
             id: one.id,
@@ -129,12 +129,12 @@ impl Logs {
         self.lock().logs.iter().map(tell).collect()
     }
 
-    /// The id of the run that writes this log, where one does.
+    /// The id of the run that writes this log, if any.
     pub(crate) fn run_of(&self, id: u64) -> Option<String> {
         self.lock().logs.iter().find(|one| one.id == id)?.status().map(|status| status.run.clone())
     }
 
-    /// The run of a log at a moment.
+    /// The run in a log at a moment.
     pub(crate) fn frame(&self, id: u64, asked: &Asked) -> Result<wire::Frame, NotTold> {
         self.at(id, asked, |fold, there, one| {
             let version = if fold.epoch == asked.epoch { asked.version } else { 0 };
@@ -144,7 +144,7 @@ impl Logs {
             frame.run.live = one.status().is_some();
             let now = one.status().filter(|_| asked.at_s.is_none());
             frame.run.awaits = now.map(tell::awaits).unwrap_or_default();
-            // Of a long log the line that sets them may not have been read.
+            // In a long log, the line that sets them may not have been read.
             if let Some(status) = now {
                 frame.run.breakpoints = tell::breakpoints(status);
             }
@@ -153,17 +153,17 @@ impl Logs {
         })
     }
 
-    /// The file and the digest of a log's task.
+    /// The task file of a log, and the digest of the task.
     pub(crate) fn task(&self, id: u64) -> Result<(PathBuf, String), NotTold> {
         self.at(id, &Asked::default(), |fold, _, _| (PathBuf::from(&fold.run.file), fold.digest.clone()))
     }
 
-    /// What a log says of its robot; nothing in one of an earlier version.
+    /// The robot named in a log; empty in a log of an earlier version.
     pub(crate) fn robot(&self, id: u64) -> Result<String, NotTold> {
         self.at(id, &Asked::default(), |fold, _, _| fold.run.robot.clone())
     }
 
-    /// The world of a log at a moment.
+    /// The world in a log at a moment.
     pub(crate) fn world(&self, id: u64, asked: &Asked, filter: &str) -> Result<wire::World, NotTold> {
         self.at(id, asked, |fold, _, _| {
             let path =
@@ -173,7 +173,7 @@ impl Logs {
         })
     }
 
-    /// The cell of a log at a moment, with a robot or why none is known.
+    /// The cell in a log at a moment, with a robot, or the reason why none is known.
     pub(crate) fn cell(
         &self,
         id: u64,
@@ -189,24 +189,24 @@ impl Logs {
         })
     }
 
-    /// A run writes this log.
+    /// Whether a run writes this log.
     pub(crate) fn is_live(&self, id: u64) -> bool {
         self.run_of(id).is_some()
     }
 
     fn lock(&self) -> std::sync::MutexGuard<'_, All> {
-        // What a panic left is what was read so far.
+        // A panic leaves what was read so far.
         self.all.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// With the fold of a log at a moment, and whether everything until then was read.
+    /// Calls `then` with the fold of a log at a moment, and with whether everything until then was read.
     fn at<T>(&self, id: u64, asked: &Asked, then: impl FnOnce(&Fold, bool, &Followed) -> T) -> Result<T, NotTold> {
         let mut all = self.lock();
         let All { logs, numbers, replays } = &mut *all;
         let one = logs.iter_mut().find(|one| one.id == id).ok_or(NotTold::Unknown(id))?;
         let looked = one.look();
         if !matches!(looked, Ok(true)) {
-            // Another log has its name now, or none.
+            // The path leads to another log now, or to none.
             one.live = None;
             replays.retain(|replay| replay.log != id);
         }
@@ -233,7 +233,7 @@ impl Logs {
     }
 }
 
-/// The replay that a page goes on with, or a new one: where it wants an earlier moment than was read, or one far ahead.
+/// The replay that a page continues; a new one if the page wants an earlier moment than was read, or one far ahead.
 fn replay(
     replays: &mut Vec<Replay>,
     numbers: &mut u64,
@@ -263,7 +263,7 @@ fn replay(
 }
 
 impl All {
-    /// Its place. Where there are as many as there may be, one that was not named by the user is given up for it.
+    /// Adds a log; returns its index. At the maximum, a log that was not named by the user is dropped for it.
     fn add(&mut self, path: PathBuf, named: bool) -> usize {
         if self.logs.len() >= MAX_LOGS + MAX_LOGS_OF_RUNS {
             let Some(oldest) = self.logs.iter().position(|one| !one.named && one.heard.is_none()) else {
@@ -280,12 +280,12 @@ impl All {
 }
 
 impl Followed {
-    /// What its run says of itself, where one writes it.
+    /// The status of its run, if one writes it.
     fn status(&self) -> Option<&RunStatus> {
         self.heard.as_ref().filter(|(heard, _)| heard.elapsed() < HEARD_WITHIN).map(|(_, status)| status)
     }
 
-    /// How long the log is by now. Whether it is still the log that it was.
+    /// Checks the length of the log. Returns whether it is still the same log.
     fn look(&mut self) -> Result<bool, LogError> {
         let mut is_same = true;
         self.parts = Some(match self.parts.take() {
@@ -308,7 +308,7 @@ impl Followed {
         self.parts.as_ref().map_or((0, Timestamp(0)), |parts| parts.before(moment, BEFORE_BYTES))
     }
 
-    /// Reads on to the end of the log. Whether it was reached.
+    /// Reads on to the end of the log. Returns whether the end was reached.
     fn follow(&mut self, numbers: &mut u64) -> Result<bool, LogError> {
         let end = Timestamp(u64::MAX);
         if self.live.is_none() {
@@ -325,12 +325,12 @@ impl Followed {
     }
 }
 
-/// Edges as the pages know them.
+/// Dependencies in the pages' notation.
 pub(crate) fn edges(fold: &Fold, id: InstanceId) -> Vec<wire::Edge> {
     fold.edges(id).map(|(from, bond): (InstanceId, Bond)| wire::Edge { from: from.0, kind: bond.name() }).collect()
 }
 
-/// As the file system names it, so that the log of a run is known by its own word, too.
+/// The canonical path, so that a log is recognised by the path that its run reports, too.
 pub(crate) fn absolute(path: &Path) -> std::io::Result<PathBuf> {
     std::fs::canonicalize(path)
 }

@@ -1,31 +1,31 @@
-//! The meshes of a robot's visuals, as the pages draw them: corners and normals, packed. Pure.
+//! Packs the meshes of a robot's visuals for the pages: vertices with normals. Pure.
 //!
-//! A corner has twelve bytes, little-endian, three corners are a triangle: x, y and z as parts of 65535 of the mesh's bounding box, two bytes of
-//! nothing, the normal's x, y and z as signed parts of 127, a byte of nothing. So a graphics card takes it as it is. Where a robot has more
-//! triangles than pages draw well, its meshes are made coarser.
+//! A vertex has twelve bytes, little-endian; three vertices are a triangle: x, y and z in 1/65535 of the mesh's bounding box, two unused
+//! bytes, the normal's x, y and z as signed values in 1/127, an unused byte. A graphics card can use this as it is. If a robot has more
+//! triangles than pages draw smoothly, its meshes are simplified.
 
 use ratn_motion::mesh::Mesh;
 
-/// Triangles of all meshes of a robot at the most, some 11 MB.
+/// Maximum number of triangles of a robot, all meshes together: about 11 MB.
 const MOST_TRIANGLES: usize = 300_000;
-/// What has so many parts along each edge of its bounding box is whole.
+/// Number of steps along each edge of a mesh's bounding box.
 const PARTS: f64 = 65_535.0;
 const CORNER_BYTES: usize = 12;
-/// Faces that meet at a smaller angle are one surface, with one normal at a corner: the cosine of 35°.
+/// Faces that meet at a smaller angle form one smooth surface, with one normal per vertex: the cosine of 35°.
 const SMOOTH: f64 = 0.82;
-/// A corner of more triangles has the normal of each.
+/// At a vertex of more triangles, each triangle keeps its own normal.
 const MOST_AT_A_CORNER: usize = 64;
 
 type Vector = [f64; 3];
 type Corner = [u16; 3];
 
-/// A mesh that is packed.
+/// A packed mesh.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Packed {
-    /// The middle of its bounding box, and the edges of that.
+    /// The centre of its bounding box, and the box's size.
     pub(crate) centre: Vector,
     pub(crate) size: Vector,
-    /// Its corners.
+    /// Its vertices.
     pub(crate) bytes: Vec<u8>,
 }
 
@@ -36,7 +36,7 @@ pub(crate) fn packed(meshes: &[Mesh]) -> Vec<Packed> {
 
 fn packed_within(meshes: &[Mesh], most: usize) -> Vec<Packed> {
     let all: usize = meshes.iter().map(|mesh| mesh.triangles().len()).sum();
-    // Each gives up the same share.
+    // All meshes are reduced by the same ratio.
     let share = |mesh: &Mesh| (mesh.triangles().len() * most.min(all)).div_ceil(all);
     meshes.iter().map(|mesh| Packed::of(mesh, share(mesh))).collect()
 }
@@ -64,10 +64,11 @@ impl Packed {
     }
 }
 
-/// The first cells that make triangles fewer; smaller ones hardly do.
+/// The first cell size that removes triangles; smaller ones hardly do.
 const FIRST_CELL: u32 = 16;
 
-/// At most so many triangles: corners go to the middles of cells, which become larger until what is left of the triangles is few enough.
+/// Simplifies to at most `most` triangles by vertex clustering: vertices move to the centres of grid cells, which grow until few enough
+/// triangles remain.
 fn coarser(triangles: Vec<[Corner; 3]>, most: usize) -> Vec<[Corner; 3]> {
     let is_flat = |[a, b, c]: &[Corner; 3]| a == b || b == c || a == c;
     let mut cell: u32 = 1;
@@ -76,7 +77,7 @@ fn coarser(triangles: Vec<[Corner; 3]>, most: usize) -> Vec<[Corner; 3]> {
         let moved = triangles.iter().map(|triangle| triangle.map(|corner| corner.map(middle)));
         let mut left: Vec<[Corner; 3]> = moved.filter(|triangle| !is_flat(triangle)).collect();
         if cell > 1 {
-            // Several that came to the same place are one.
+            // Triangles that became equal are merged.
             left.sort_unstable();
             left.dedup();
         }
@@ -87,8 +88,8 @@ fn coarser(triangles: Vec<[Corner; 3]>, most: usize) -> Vec<[Corner; 3]> {
     }
 }
 
-/// A unit normal for each corner of each triangle: the mean of the triangles that meet there, as far as they are of one surface, each by its
-/// angle there, so that it does not matter how a face is cut into triangles.
+/// A unit normal for each vertex of each triangle: the mean over the triangles of the same surface that meet there, weighted by their angle
+/// there, so that it does not matter how a face is divided into triangles.
 fn normals(triangles: &[[Corner; 3]], metres: impl Fn(Corner) -> Vector) -> Vec<Vector> {
     let faces: Vec<[Vector; 3]> = triangles.iter().map(|triangle| triangle.map(&metres)).collect();
     let upright = |[a, b, c]: &[Vector; 3]| unit(cross(minus(*b, *a), minus(*c, *a)));
@@ -127,7 +128,7 @@ fn cross(a: Vector, b: Vector) -> Vector {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-/// Without a direction it is upright.
+/// The unit vector; z for a vector without a direction.
 fn unit(vector: Vector) -> Vector {
     let length = dot(vector, vector).sqrt();
     if length > 0.0 { vector.map(|part| part / length) } else { [0.0, 0.0, 1.0] }
@@ -138,7 +139,7 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
 
-    /// A grid of so many squares along x and y, over 2 m by 1 m, bent down behind the middle at an angle.
+    /// A grid of `squares` squares along x and y, over 2 m by 1 m, bent down at the middle by an angle.
     fn grid(squares: usize, angle_rad: f64) -> Mesh {
         let place = |i: usize, j: usize| {
             let (u, y) = (2.0 * i as f64 / squares as f64 - 1.0, j as f64 / squares as f64);
@@ -152,7 +153,7 @@ mod tests {
         Mesh::new((0..squares * squares).flat_map(square).collect()).unwrap()
     }
 
-    /// Where a corner is, in metres, and its normal.
+    /// Vertices, in metres, with their normals.
     fn corners(packed: &Packed) -> Vec<(Vector, Vector)> {
         let read = |bytes: &[u8]| {
             let part = |i: usize| f64::from(u16::from_le_bytes([bytes[2 * i], bytes[2 * i + 1]])) / PARTS - 0.5;
@@ -180,7 +181,7 @@ mod tests {
             let on_edge = |(at, _): &(Vector, Vector)| at[0].abs() < 1e-3;
             corners(&packed).into_iter().filter(on_edge).map(|(_, normal)| normal[0]).collect::<Vec<f64>>()
         };
-        // Half of a bend of 0.4 rad at each corner on it; at a right angle each side has its own.
+        // At a bend of 0.4 rad, vertices have half of it; at a right angle, each side has its own normal.
         assert!(normals_of(0.4).iter().all(|x| (x - 0.2_f64.sin()).abs() < 0.05), "{:?}", normals_of(0.4));
         let sharp = normals_of(std::f64::consts::FRAC_PI_2);
         assert!(sharp.iter().all(|x| x.abs() < 0.01 || (x - 1.0).abs() < 0.01), "{sharp:?}");

@@ -1,5 +1,4 @@
-//! A connection that is given up when its other end does not read: nothing that is written stays in memory for a browser that does not
-//! keep up.
+//! A connection that is closed when its other end does not read: no data stay in memory for a browser that does not keep up.
 
 use std::future::Future;
 use std::io::{self, ErrorKind, IoSlice};
@@ -9,7 +8,7 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::time::{Instant, Sleep};
 
-/// A stream whose writes fail when nothing of them was taken for so long.
+/// A stream whose writes fail when the other end has accepted nothing for `patience`.
 #[derive(Debug)]
 pub(crate) struct Patient<S> {
     stream: S,
@@ -23,7 +22,7 @@ impl<S> Patient<S> {
         Patient { stream, patience, stuck: Box::pin(tokio::time::sleep(patience)), is_stuck: false }
     }
 
-    /// What became of an attempt to write.
+    /// Handles the result of an attempt to write.
     fn written<T>(&mut self, context: &mut Context<'_>, tried: Poll<io::Result<T>>) -> Poll<io::Result<T>> {
         if tried.is_ready() {
             self.is_stuck = false;

@@ -1,4 +1,4 @@
-//! A robot as the pages draw it: its links, its joints, and which of those an arm, a head, fingers or a base are. Pure.
+//! A robot for the pages: its links, its joints, and which joints belong to an arm, a head, fingers or a base. Pure.
 
 use crate::film::{Film, MOST_JOINTS, Part, Track};
 use crate::looks::{self, Packed};
@@ -13,42 +13,42 @@ use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// A robot with more links, joints or shapes is not shown.
+/// Maximum number of links, of joints and of shapes; a robot with more is not shown.
 const MOST_LINKS: usize = 512;
 const MOST_SHAPES: usize = 4_096;
-/// Objects that are told.
+/// Maximum number of objects sent.
 const MOST_OBJECTS: usize = 400;
-/// Visuals that are not read are named, the first of them.
+/// Maximum number of unreadable visuals that are named.
 const MOST_LACKS: usize = 8;
-/// A longer name is cut.
+/// Maximum length of a name; a longer one is truncated.
 const MOST_CHARACTERS: usize = 200;
-/// The posture in which a cell begins.
+/// The initial posture of a cell.
 const HOME: &str = "home";
 
-/// How the robot of a log is known: the robot, and whence, or why it is not known. It may read files.
+/// Loads the robot of a log: the robot with its source, or why it is unknown. May read files.
 #[derive(Clone)]
 pub struct Robots(Arc<Load>);
 
 type Load = dyn Fn(&str) -> Result<Known, String> + Send + Sync;
 
-/// A robot that is known.
+/// A robot that was loaded.
 #[derive(Debug)]
 pub struct Known {
     /// The robot.
     pub robot: Robot,
-    /// What it looks like. A robot without visuals is drawn as what of it can collide.
+    /// Its visuals. A robot without visuals is drawn by its collision shapes.
     pub looks: Looks,
-    /// Whence it is known, in a few words.
+    /// Where it comes from, in a few words.
     pub whence: String,
 }
 
 impl Robots {
-    /// Loads it so, given what the log says of it: a name or a path, or nothing.
+    /// With this function, which gets the robot's name or path from the log, or an empty text.
     pub fn by(load: impl Fn(&str) -> Result<Known, String> + Send + Sync + 'static) -> Robots {
         Robots(Arc::new(load))
     }
 
-    /// None is known.
+    /// Knows no robot.
     pub fn none() -> Robots {
         Robots::by(|_| Err("no robot was named".to_owned()))
     }
@@ -68,7 +68,7 @@ impl std::fmt::Debug for Robots {
 #[derive(Debug)]
 pub(crate) struct Shown {
     told: wire::Robot,
-    /// The meshes of its visuals, by their numbers.
+    /// The meshes of its visuals, by number.
     meshes: Vec<Bytes>,
     joints: BTreeMap<String, usize>,
     arms: Vec<Arm>,
@@ -80,7 +80,7 @@ pub(crate) struct Shown {
 struct Arm {
     name: String,
     joints: Vec<usize>,
-    /// The joint of its fingers, and where they are open.
+    /// The joint of the fingers, and its open position.
     fingers: Option<(usize, f64)>,
 }
 
@@ -134,17 +134,17 @@ impl Shown {
         Ok(Shown { told, meshes, arms, head, base, joints })
     }
 
-    /// The corners of a mesh, by its number ([`looks`]).
+    /// The vertices of a mesh, by its number ([`looks`]).
     pub(crate) fn mesh(&self, number: usize) -> Option<Bytes> {
         self.meshes.get(number).cloned()
     }
 
-    /// As the pages know it.
+    /// The robot in the pages' notation.
     pub(crate) fn told(&self) -> wire::Robot {
         self.told.clone()
     }
 
-    /// Why a log is of another robot.
+    /// Checks whether the log may be of this robot; the error says why not.
     fn may_be_of(&self, film: &Film) -> Result<(), String> {
         let name = &self.told.name;
         match (film.drives(), self.base.is_empty()) {
@@ -158,7 +158,7 @@ impl Shown {
         }
     }
 
-    /// So many positions are those of these joints; what a robot does not have has none.
+    /// Checks that there are as many positions as joints; a part without joints accepts any number.
     fn of_length(&self, positions: usize, joints: &[usize]) -> Result<(), String> {
         if joints.is_empty() || joints.len() == positions {
             return Ok(());
@@ -167,7 +167,7 @@ impl Shown {
         Err(format!("the log has positions for {positions} joints where {name} has {}", joints.len()))
     }
 
-    /// The joints of a part, or why it is not one of this robot.
+    /// The joints of a part, or why the robot has no such part.
     fn joints_of(&self, part: &Part) -> Result<Vec<usize>, String> {
         let name = &self.told.name;
         match part {
@@ -181,13 +181,13 @@ impl Shown {
             Part::Fingers(arm) => {
                 Ok(self.arm(arm.as_deref())?.fingers.map(|(joint, _)| vec![joint]).unwrap_or_default())
             }
-            // What it does not have, the log may have from somewhere else.
+            // If the robot lacks this part, the log may still be of it.
             Part::Head => Ok(self.head.clone()),
             Part::Base => Ok(self.base.clone()),
         }
     }
 
-    /// A robot with one arm takes every name for it.
+    /// For a robot with one arm, every name means that arm.
     fn arm(&self, name: Option<&str>) -> Result<&Arm, String> {
         let found = match (name, self.arms.as_slice()) {
             (_, [only]) => Some(only),
@@ -211,12 +211,12 @@ impl Shown {
     }
 }
 
-/// A robot that is not known.
+/// An unknown robot.
 pub(crate) fn unknown(note: String) -> wire::Robot {
     wire::Robot { note, ..wire::Robot::default() }
 }
 
-/// The cell as the pages know it, from a version on.
+/// The cell in the pages' notation, from a version on.
 pub(crate) fn cell(
     film: &Film,
     version: u64,
@@ -226,7 +226,7 @@ pub(crate) fn cell(
     let version = if version > film.version() { 0 } else { version };
     let track =
         |shown: &Shown, track: &Track| shown.track(track, track.instance.map_or_else(String::new, |id| cut(&path(id))));
-    // A log that moves what the robot does not have is of another one, whenever it does.
+    // A log that moves joints which this robot lacks is of another robot, at all its moments.
     let (fits, note, tracks) = match robot {
         Err(note) => (false, note.to_owned(), Vec::new()),
         Ok(shown) => match shown.may_be_of(film) {
@@ -274,12 +274,12 @@ fn objects(scene: &Scene) -> Vec<wire::Object> {
     scene.objects.iter().take(MOST_OBJECTS).map(told).collect()
 }
 
-/// What the cell says of a thing: its bounding box.
+/// The cell's report of an object: its bounding box.
 pub(crate) fn true_object(name: &str, size: [f64; 3], pose: &Pose, held: bool) -> wire::Object {
     wire::Object { name: cut(name), shape: shape("box", &size, pose), held }
 }
 
-/// What of a link is seen. Of one of which something cannot be read that is what can collide, too.
+/// The visuals of a link. If one of them cannot be read, the collision shapes are added.
 fn visuals(link: &ratn_motion::robot::Link, looks: &Looks, packed: &[Packed]) -> Vec<wire::Visual> {
     let own = looks.visuals.iter().filter(|visual| visual.link == link.name);
     let mut seen: Vec<wire::Visual> = own
@@ -302,7 +302,7 @@ fn visuals(link: &ratn_motion::robot::Link, looks: &Looks, packed: &[Packed]) ->
     seen
 }
 
-/// What is not seen of a robot, in a sentence each.
+/// The visuals that are missing, in a sentence each.
 fn lacks(looks: &Looks) -> Vec<String> {
     let told = looks.lacks.iter().take(MOST_LACKS).map(|lack| match lack.link.as_str() {
         "" => cut(&lack.reason),
@@ -346,19 +346,19 @@ fn place(pose: &Pose) -> wire::Place {
 
 fn point(point: &ratn_model::value::TrajectoryPoint) -> wire::Point {
     let rounded = |values: &[f64]| values.iter().copied().map(round).collect();
-    // Speeds of another number than there are joints say nothing.
+    // Velocities in another number than the joints are ignored.
     let velocities =
         if point.velocities.len() == point.positions.len() { rounded(&point.velocities) } else { Vec::new() };
     wire::Point { after_s: point.time_s, positions: rounded(&point.positions), velocities }
 }
 
-/// To a micrometre, or a millionth of a radian: shorter to tell, and nobody sees it.
+/// Rounds to a micrometre, or a microradian: shorter to send, and invisible.
 fn round(value: f64) -> f64 {
     let rounded = (value * 1e6).round() / 1e6;
     match rounded.is_finite() {
         true if rounded == 0.0 => 0.0,
         true => rounded,
-        // So large a number has no micrometres.
+        // A value this large has no such digits.
         false => value,
     }
 }
@@ -411,7 +411,7 @@ mod tests {
         assert_eq!(mast.shapes[0].at.quaternion, [0.0, 0.0, 0.0, 1.0], "it stands upright");
     }
 
-    /// As the pages do it.
+    /// The frames as the pages compute them.
     fn frames(robot: &wire::Robot, positions: &[f64]) -> Vec<Pose> {
         let three = |values: &[f64]| <[f64; 3]>::try_from(values).unwrap();
         let mut frames: Vec<Pose> = Vec::new();
@@ -477,7 +477,7 @@ mod tests {
     #[test]
     fn a_log_of_another_robot_does_not_become_one_of_this_with_time() {
         let mut film = film(&[FOREIGN]);
-        // As many motions under way as make the track of before go.
+        // As many motions under way as it takes for the earlier track to be dropped.
         let known = FOREIGN.replace("elbow", "arm_joint_1");
         for id in 10..210 {
             let line = known.replace(r#""instance":3"#, &format!(r#""instance":{id}"#));

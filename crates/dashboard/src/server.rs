@@ -1,4 +1,4 @@
-//! HTTP for the pages and what they ask. Bounded: few connections, little to read, and whoever does not read is given up.
+//! The HTTP server for the pages and their requests. Limited: few connections, small requests, and a client that does not read is cut off.
 
 use crate::annotations::{self, Editing, MAX_BODY, Problem, Proposal};
 use crate::gate::{self, HEADERS, Refused, Token};
@@ -35,48 +35,49 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::AbortHandle;
 
-/// Connections at the same time; a browser has six. For one more the oldest is closed that has not shown the token, else that one.
+/// Maximum number of connections at once; a browser has six. For a further one, the oldest connection without the token is closed; if there
+/// is none, the further one itself.
 const MAX_CONNECTIONS: usize = 96;
-/// The head of a request has at most this many bytes …
+/// Maximum size of a request's head, in bytes …
 const MAX_REQUEST_BYTES: usize = 16 * 1024;
-/// … and this many headers …
+/// … maximum number of its headers …
 const MAX_HEADERS: usize = 64;
-/// … and is there in this time, unless the options say otherwise. Whoever takes nothing of an answer for so long is given up.
+/// … and default time limit until it is complete. A client that accepts nothing of an answer for this long is cut off.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// After a connection that could not be had: the process is out of descriptors.
+/// Pause after a failed accept: the process has no free file descriptors.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
-/// Folds that are read at the same time.
+/// Maximum number of folds that are read at once.
 const MAX_READING: usize = 4;
-/// So many robots are kept; of more all are read again.
+/// Maximum number of robots cached; beyond it all are read again.
 const MOST_ROBOTS: usize = 16;
-/// A robot that could not be read is not tried again for so long.
+/// Pause before a robot that could not be read is tried again.
 const ROBOT_AGAIN: Duration = Duration::from_secs(3);
 const JSON: &str = "application/json";
 const BYTES: &str = "application/octet-stream";
 
-/// The pages, as `scripts/build-dashboard` makes them of `web/`.
+/// The pages, as `scripts/build-dashboard` builds them from `web/`.
 const PAGES: [(&str, &str, &str); 5] = [
     ("/", "text/html; charset=utf-8", include_str!("../assets/index.html")),
     ("/app.js", "text/javascript; charset=utf-8", include_str!("../assets/app.js")),
-    // Only the page that needs it loads it.
+    // Loaded only by the page that needs it.
     ("/cell.js", "text/javascript; charset=utf-8", include_str!("../assets/cell.js")),
     ("/app.css", "text/css; charset=utf-8", include_str!("../assets/app.css")),
     ("/icon.svg", "image/svg+xml", include_str!("../assets/icon.svg")),
 ];
 
-/// How the task file of a log is loaded. What is not the task of the run is not shown.
+/// Loads the task file of a log. A file that is not the task of the run is not shown.
 #[derive(Clone)]
 pub struct Tasks(Arc<Load>);
 
 type Load = dyn Fn(&Path) -> Result<Program, String> + Send + Sync;
 
 impl Tasks {
-    /// Loads them so; an error says in a sentence why one is not there.
+    /// With this function; an error is a sentence that says why a task is missing.
     pub fn by(load: impl Fn(&Path) -> Result<Program, String> + Send + Sync + 'static) -> Tasks {
         Tasks(Arc::new(load))
     }
 
-    /// Loads none.
+    /// Loads no tasks.
     pub fn none() -> Tasks {
         Tasks::by(|_| Err("task files are not read here".to_owned()))
     }
@@ -88,31 +89,31 @@ impl std::fmt::Debug for Tasks {
     }
 }
 
-/// What is shown, and where.
+/// What the dashboard shows, and where.
 #[derive(Debug, Clone)]
 pub struct Options {
-    /// Where pages are served; a loopback address. Port 0 takes one that is free.
+    /// The address of the pages: a loopback address. Port 0 takes a free one.
     pub address: SocketAddr,
-    /// Event logs, at most [`MAX_LOGS`]. The log of a run that is under way in `directory` joins them.
+    /// Event logs, at most [`MAX_LOGS`]. The log of a run under way in `directory` is added.
     pub logs: Vec<PathBuf>,
     /// The runtime directory of a system.
     pub directory: PathBuf,
-    /// Whether pages may tell a run to pause, step, go on and end.
+    /// Whether pages may pause, step, continue and end a run.
     pub control: bool,
     /// The task file whose annotations pages may change.
     pub edit: Option<Editing>,
-    /// What the clients of the system trust and show.
+    /// TLS settings of the clients of the system.
     pub tls: ClientTls,
-    /// How tasks are loaded.
+    /// Loads tasks.
     pub tasks: Tasks,
-    /// How the robot of the logs is known.
+    /// Loads the robot of a log.
     pub robots: Robots,
-    /// A browser that says or takes nothing for so long is cut off.
+    /// A browser that sends or accepts nothing for this long is cut off.
     pub patience: Duration,
 }
 
 impl Options {
-    /// Of a system's runtime directory, at a free port, without logs, to look at only.
+    /// Options for a system's runtime directory, at a free port, without logs, read-only.
     pub fn of(directory: PathBuf, tls: ClientTls) -> Options {
         let address = SocketAddr::from(([127, 0, 0, 1], 0));
         Options {
@@ -129,48 +130,48 @@ impl Options {
     }
 }
 
-/// Why nothing is served.
+/// Why the dashboard cannot be served.
 #[derive(Debug, thiserror::Error)]
 pub enum DashboardError {
-    /// Other machines could reach it.
+    /// Other machines could reach the address.
     #[error(
         "the dashboard is for this machine alone, and {address} is not a loopback address: from another machine use `ssh -L`"
     )]
     Exposed {
-        /// Which.
+        /// The address.
         address: SocketAddr,
     },
-    /// More logs than are looked at.
+    /// Too many logs were named.
     #[error("{given} logs are more than the {MAX_LOGS} that are looked at at once: name fewer")]
     TooMany {
-        /// How many were named.
+        /// Number of logs named.
         given: usize,
     },
-    /// A log that cannot be read.
+    /// A log cannot be read.
     #[error(transparent)]
     Log(#[from] LogError),
-    /// A log that is not there.
+    /// A log does not exist.
     #[error("cannot read the event log {}", path.display())]
     NoLog {
-        /// Which.
+        /// The log.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
-    /// The address cannot be had.
+    /// The address is not available.
     #[error("cannot serve pages at {address}")]
     Refused {
-        /// Which.
+        /// The address.
         address: SocketAddr,
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
-    /// There is nothing to make a token of.
+    /// The system provides no random bytes for a token.
     #[error("the system gives no random bytes for a token")]
     NoToken,
 }
 
-/// A server that has its address and does not answer yet.
+/// A server that is bound to its address and does not serve yet.
 #[derive(Debug)]
 pub struct Dashboard {
     listener: TcpListener,
@@ -179,7 +180,7 @@ pub struct Dashboard {
     patience: Duration,
 }
 
-/// What is shown to whoever has the token.
+/// The content shown to clients with the token.
 #[derive(Debug)]
 struct Shown {
     token: Token,
@@ -192,20 +193,20 @@ struct Shown {
     reading: Semaphore,
 }
 
-/// The robots of the logs, once they were asked for: each is read then, and kept.
+/// The robots of the logs: each is read when it is first asked for, and cached.
 #[derive(Debug)]
 struct KnownRobots {
     robots: Robots,
-    /// By what the logs say of them.
+    /// By the robot's name or path in the log.
     shown: Mutex<BTreeMap<String, (Instant, Loaded)>>,
 }
 
 type Loaded = Result<Arc<robot::Shown>, String>;
 
 impl KnownRobots {
-    /// That of a log which says so. May read files.
+    /// The robot of a log that names it so. May read files.
     fn get(&self, of_log: &str) -> Loaded {
-        // What a panic left is whole.
+        // A panic leaves the map intact.
         let mut shown = self.shown.lock().unwrap_or_else(PoisonError::into_inner);
         match shown.get(of_log) {
             Some((at, loaded)) if loaded.is_ok() || at.elapsed() < ROBOT_AGAIN => return loaded.clone(),
@@ -220,26 +221,26 @@ impl KnownRobots {
     }
 }
 
-/// What a question is.
+/// The head of a request.
 struct Head {
     method: Method,
     uri: Uri,
     headers: HeaderMap,
 }
 
-/// What a run is told.
+/// A command to a run.
 enum Told {
-    /// A word, and what that means.
+    /// A command word, and its meaning.
     Word(Word, &'static str),
-    /// To the question of a state.
+    /// An answer to the question of a state.
     Answer { state: String, choice: String },
-    /// Of this name, without a value.
+    /// A signal of this name, without a value.
     Signal(String),
-    /// At a state, or at all where none is said.
+    /// A breakpoint at a state, or all breakpoints if no state is given.
     Breakpoint { state: Option<String>, set: bool },
 }
 
-/// What a page is answered.
+/// An answer to a page.
 enum Answer {
     Json(String),
     Bytes(Bytes),
@@ -247,7 +248,7 @@ enum Answer {
 }
 
 impl Dashboard {
-    /// Takes the address, and looks whether the logs can be read.
+    /// Binds the address, and checks that the logs can be read.
     ///
     /// # Errors
     /// [`DashboardError`].
@@ -278,12 +279,12 @@ impl Dashboard {
         Ok(Dashboard { listener, address, shown, patience })
     }
 
-    /// What its user opens. The token stands behind `#`, which browsers send nobody.
+    /// The URL that its user opens. The token is in the fragment after `#`, which browsers do not send.
     pub fn url(&self) -> String {
         format!("http://{}/#token={}", self.address, self.shown.token.text())
     }
 
-    /// Answers for as long as this is waited for.
+    /// Serves for as long as the future is polled.
     pub async fn serve(self) {
         let mut open: VecDeque<Open> = VecDeque::new();
         loop {
@@ -301,7 +302,7 @@ impl Dashboard {
             let has_shown_token = Arc::new(AtomicBool::new(false));
             let mark = Arc::clone(&has_shown_token);
             let task = tokio::spawn(async move {
-                // Who left, or was too slow, hears nothing.
+                // A client that left, or was too slow, gets no answer.
                 let _ = answer(shown, connection, patience, mark).await;
             });
             open.push_back(Open { has_shown_token, task: task.abort_handle() });
@@ -309,7 +310,7 @@ impl Dashboard {
     }
 }
 
-/// A connection that is open.
+/// An open connection.
 struct Open {
     has_shown_token: Arc<AtomicBool>,
     task: AbortHandle,
@@ -333,7 +334,7 @@ async fn answer(
             if may_look {
                 has_shown_token.store(true, Ordering::Relaxed);
             }
-            // In the body of other questions nothing stands.
+            // Other requests have no body.
             let has_body =
                 may_look && shown.edit.is_some() && head.method == Method::POST && is_change(head.uri.path());
             let body = match has_body {
@@ -356,16 +357,17 @@ async fn answer(
         .await
 }
 
-/// Of a body that is too long so many bytes are read.
+/// Maximum number of bytes read and discarded of a body that is too long.
 const MAX_FORGOTTEN: usize = 16 * MAX_BODY;
 const TOO_LARGE: &str = "a change has at most 64 KiB";
 
-/// Whether what is to be changed stands in the body.
+/// Whether a request carries a change in its body.
 fn is_change(path: &str) -> bool {
     matches!(path, "/api/annotations/check" | "/api/annotations/gain" | "/api/annotations/save")
 }
 
-/// A body of at most [`MAX_BODY`] bytes. Of a longer one some more is read and forgotten: who is still writing does not hear why it is refused.
+/// Reads a body of at most [`MAX_BODY`] bytes. Of a longer one some more is read and discarded: a client that still writes would not read
+/// the refusal.
 async fn body(mut incoming: Incoming) -> Option<Vec<u8>> {
     let (mut bytes, mut length) = (Vec::new(), 0);
     while let Some(frame) = std::future::poll_fn(|context| Pin::new(&mut incoming).poll_frame(context)).await {
@@ -434,7 +436,7 @@ impl Shown {
         }
     }
 
-    /// Asks the system for its runs: their logs are among those that are looked at.
+    /// Asks the system for its runs, and adds their logs.
     async fn hear(&self) {
         if let Heard::Runs(statuses) = self.system.runs().await {
             self.logs.hear(statuses);
@@ -459,7 +461,7 @@ impl Shown {
             Err(problem) => return Answer::Refused(StatusCode::BAD_REQUEST, problem),
         };
         if asked.at_s.is_none() {
-            // Without an answer the log is shown as far as it is written.
+            // Without an answer, the log is shown as far as it is written.
             self.hear().await;
         }
         let control = self.control;
@@ -511,7 +513,7 @@ impl Shown {
         .await
     }
 
-    /// The corners of a mesh of the robot of a log: by number, so that no question can name a file.
+    /// The vertices of a mesh of a log's robot, by number, so that no request can name a file.
     async fn mesh(&self, query: &Query<'_>) -> Answer {
         let id = match query.asked() {
             Ok((id, _)) => id,
@@ -538,7 +540,7 @@ impl Shown {
             Ok(asked) => asked,
             Err(problem) => return Answer::Refused(StatusCode::BAD_REQUEST, problem),
         };
-        // How things are is known of now alone.
+        // The true state of the cell is known only for the present.
         let truth = match asked.at_s.is_none() && self.logs.is_live(id) {
             true => self.system.truth().await,
             false => None,
@@ -567,7 +569,7 @@ impl Shown {
         .await
     }
 
-    /// Looks at the logs in a thread in which that keeps nobody waiting.
+    /// Reads logs in a blocking thread.
     async fn looking(&self, look: impl FnOnce(&Logs) -> Result<Answer, NotTold> + Send + 'static) -> Answer {
         let Ok(_place) = self.reading.acquire().await else {
             return Answer::Refused(StatusCode::SERVICE_UNAVAILABLE, "the dashboard ends".to_owned());
@@ -591,7 +593,7 @@ impl Shown {
         }
     }
 
-    /// A change that is checked, simulated or written.
+    /// Checks, simulates or writes a change.
     async fn change(&self, edit: &Editing, path: &str, body: &[u8]) -> Answer {
         let proposal = match Proposal::read(body) {
             Ok(proposal) => proposal,
@@ -607,7 +609,7 @@ impl Shown {
         }
     }
 
-    /// Reads and checks the task file in a thread in which that keeps nobody waiting.
+    /// Reads and checks the task file in a blocking thread.
     async fn editing<T: Serialize + Send + 'static>(
         &self,
         edit: &Editing,
@@ -627,7 +629,7 @@ impl Shown {
         }
     }
 
-    /// Whether the pages may tell anybody anything.
+    /// The refusal if the pages are read-only.
     fn only_looks(&self) -> Option<Answer> {
         let problem = "these pages only look: `ratn dashboard --control` lets them steer runs and pools";
         (!self.control).then(|| Answer::Refused(StatusCode::FORBIDDEN, problem.to_owned()))
@@ -681,7 +683,7 @@ impl Shown {
                 return Answer::Refused(StatusCode::BAD_REQUEST, problem);
             }
         };
-        // The page says which run it means: another may have begun since.
+        // The page names the run it means: another one may have begun since.
         self.hear().await;
         let Some(run) = query.number("log").and_then(|id| self.logs.run_of(id)) else {
             let problem = "no run writes this log any more".to_owned();
@@ -705,7 +707,7 @@ impl Shown {
     }
 }
 
-/// What stands behind `?`.
+/// The query part of a URL, after `?`.
 struct Query<'q>(&'q str);
 
 impl<'q> Query<'q> {
@@ -713,7 +715,7 @@ impl<'q> Query<'q> {
         Query(text)
     }
 
-    /// The text of a name, decoded; empty where it is not there.
+    /// The decoded value of a parameter; empty if it is missing.
     fn text(&self, name: &str) -> String {
         let pairs = self.0.split('&').filter_map(|pair| pair.split_once('='));
         let value = pairs.filter(|(key, _)| *key == name).map(|(_, value)| value).next().unwrap_or_default();
@@ -737,7 +739,7 @@ impl<'q> Query<'q> {
         self.text(name).parse().ok()
     }
 
-    /// Which log, and what of it is known.
+    /// The log asked for, and what the page knows of it.
     fn asked(&self) -> Result<(u64, Asked), String> {
         let id = self.number("log").ok_or("say which log: `log=NUMBER`, as /api/about lists them")?;
         let at_s = match self.text("at").as_str() {

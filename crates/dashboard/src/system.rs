@@ -1,7 +1,7 @@
-//! The system that is up: its resources, who holds them and who waits, its hosts with their workers, and the runs that are under way.
+//! The running system: its resources with their holders and queues, its hosts with their workers, and the runs under way.
 //!
-//! It asks the daemons as every client does, no more often than once in [`FRESH`] however many pages there are, and says what is wrong
-//! where they do not answer. What somebody may see and do is theirs to decide (`docs/who-may-speak.md`).
+//! It asks the daemons as every client does, at most once per [`FRESH`] for all pages together, and reports a problem if they do not
+//! answer. The daemons decide what a user may see and do (`docs/who-may-speak.md`).
 
 use crate::{robot, wire};
 use futures::future::join_all;
@@ -21,22 +21,22 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use tokio::sync::Mutex;
 
-/// What was heard is not asked again for so long.
+/// For this long an answer is reused.
 const FRESH: Duration = Duration::from_millis(900);
 const RUN_FRESH: Duration = Duration::from_millis(250);
 const TRUTH_FRESH: Duration = Duration::from_millis(250);
-/// Who has not answered by then does not count.
+/// Time limit for an answer.
 const PATIENCE: Duration = Duration::from_secs(3);
-/// The simulated cell, by the name of its endpoint file.
+/// The role of the simulated cell: the name of its endpoint file.
 const CELL: &str = "cell";
-/// Resources, acquires, sessions, workers and things in the cell that are told of.
+/// Maximum number of resources, acquires, sessions, workers and objects sent.
 const MOST: usize = 1_000;
-/// The end of what a worker has written.
+/// Size of the shown end of a worker's output.
 const TAIL_BYTES: usize = 16 << 10;
-/// More of it is not read through.
+/// Maximum size of an output that is read for that.
 const MOST_LOG_BYTES: usize = 64 << 20;
 
-/// What is heard of the runs of a system.
+/// The answer about the runs of a system.
 #[derive(Debug)]
 pub(crate) enum Heard {
     /// They were asked a moment ago.
@@ -56,7 +56,7 @@ pub(crate) struct System {
 }
 
 impl System {
-    /// Of what has its endpoint files here; it need not be up.
+    /// The system with its endpoint files in this directory; it need not be running.
     pub(crate) fn of(directory: PathBuf, tls: &ClientTls) -> System {
         System {
             directory,
@@ -67,12 +67,12 @@ impl System {
         }
     }
 
-    /// Where its endpoint files are.
+    /// The directory of its endpoint files.
     pub(crate) fn directory(&self) -> String {
         self.directory.display().to_string()
     }
 
-    /// What its runs are doing.
+    /// The statuses of its runs.
     pub(crate) async fn runs(&self) -> Heard {
         let mut asked = self.run.lock().await;
         if asked.is_some_and(|asked| asked.elapsed() < RUN_FRESH) {
@@ -83,22 +83,22 @@ impl System {
         Heard::Runs(statuses)
     }
 
-    /// Tells a run, by its id.
+    /// Sends a command to a run, by its id.
     pub(crate) async fn tell(&self, run: &str, word: Word) -> std::io::Result<()> {
         let told = control::tell(&self.directory, run, word).await;
-        // What it does now is asked at once.
+        // Its new status has to be asked for at once.
         *self.run.lock().await = None;
         told
     }
 
-    /// Sends a run what a state of it waits for; what became of that.
+    /// Sends a run the message that a state of it waits for; returns the result.
     pub(crate) async fn send(&self, message: &Message) -> std::io::Result<String> {
         let sent = control::send(&self.directory, message).await;
         *self.run.lock().await = None;
         sent
     }
 
-    /// Where things are, as the simulated cell knows; none where there is no such cell.
+    /// The true objects in the simulated cell; `None` without such a cell.
     pub(crate) async fn truth(&self) -> Option<wire::Truth> {
         let cell = RuntimeDirectory::at(&self.directory).find(CELL).ok()?;
         let mut seen = self.truth.lock().await;
@@ -120,7 +120,7 @@ impl System {
         Some(truth)
     }
 
-    /// As the pages know it.
+    /// The system in the pages' notation.
     pub(crate) async fn told(&self) -> wire::System {
         let mut seen = self.seen.lock().await;
         if let Some((_, system)) = seen.as_ref().filter(|(at, _)| at.elapsed() < FRESH) {
@@ -150,7 +150,7 @@ impl System {
     async fn ask(&self, directory: &RuntimeDirectory, manager: &Endpoint) -> Result<wire::System, CallError> {
         let client = ResourceClient::new(&self.channels, manager, "")?;
         let (resources, waiting) = tokio::try_join!(client.list(&[]), client.explain(""))?;
-        // Who may not list sessions sees the rest.
+        // A client that may not list sessions sees the rest.
         let sessions = client.sessions().await.unwrap_or_default();
         let hosts = hosts_in(directory, &resources);
         let mut hosts = join_all(hosts.into_iter().map(|(name, endpoint)| Box::pin(self.host(name, endpoint)))).await;
@@ -182,7 +182,7 @@ impl System {
         wire::Host { name, problem, ..wire::Host::default() }
     }
 
-    /// Every process manager there is.
+    /// All process managers.
     async fn hosts(&self, directory: &RuntimeDirectory) -> Result<Vec<(String, Endpoint)>, CallError> {
         let listed = match directory.find(resource_manager::ROLE) {
             Ok(manager) => {
@@ -193,7 +193,7 @@ impl System {
         Ok(hosts_in(directory, &listed))
     }
 
-    /// Changes how many workers a pool has.
+    /// Changes the number of workers in a pool.
     pub(crate) async fn scale(&self, host: &str, template: &str, scale: Scale) -> Result<(), String> {
         let directory = RuntimeDirectory::at(&self.directory);
         let scaling = async {
@@ -203,7 +203,7 @@ impl System {
             Ok::<bool, CallError>(true)
         };
         let scaled = tokio::time::timeout(PATIENCE, Box::pin(scaling)).await;
-        // What it is now is asked at once.
+        // The new number has to be asked for at once.
         *self.seen.lock().await = None;
         match scaled {
             Ok(Ok(true)) => Ok(()),
@@ -213,7 +213,7 @@ impl System {
         }
     }
 
-    /// The end of what a worker has written.
+    /// The end of a worker's output.
     pub(crate) async fn tail(&self, worker: &str) -> Result<wire::Tail, String> {
         let directory = RuntimeDirectory::at(&self.directory);
         let reading = async {
@@ -250,7 +250,7 @@ impl System {
     }
 }
 
-/// The hosts among resources, and this one, which may not have come as far as the resource manager.
+/// The hosts among the resources, and this one, which may not be registered with the resource manager yet.
 fn hosts_in(directory: &RuntimeDirectory, resources: &[Resource]) -> Vec<(String, Endpoint)> {
     let registered = resources.iter().filter(|one| one.kind == process_manager::HOST_KIND);
     let mut hosts: Vec<(String, Endpoint)> =
@@ -263,7 +263,7 @@ fn hosts_in(directory: &RuntimeDirectory, resources: &[Resource]) -> Vec<(String
     hosts
 }
 
-/// None of what has no place or no size.
+/// `None` for an object without a pose or a size.
 fn true_object(one: &TrueObject) -> Option<wire::Object> {
     let pose = one.pose.as_ref().and_then(|pose| Pose::try_from(pose.clone()).ok())?;
     let size = one.size_m.clone().try_into().ok()?;

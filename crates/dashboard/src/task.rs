@@ -1,5 +1,5 @@
-//! A task as its author wrote it: its states, which of them a log may never mention, and which data and decisions go from one to
-//! another. A log tells what happened; this says what was meant. Pure: it takes a program that was loaded.
+//! A task as its author wrote it: its states, also those that a log never mentions, and the data and decisions that go from one to another.
+//! A log tells what happened; this shows what was intended. Pure: it takes a loaded program.
 
 use crate::wire;
 use ratn_executive::executive::Executive;
@@ -9,12 +9,12 @@ use ratn_model::program::{Program, State, StateKind};
 use ratn_model::slot::Slot;
 use std::collections::BTreeSet;
 
-/// States and flows of larger tasks are not told.
+/// Maximum number of states, and of flows.
 const MOST: usize = 20_000;
-/// Outputs of outputs and variables of variables are followed so far.
+/// Maximum depth to which outputs of outputs and variables of variables are followed.
 const MOST_DEPTH: usize = 16;
 
-/// As the pages know it.
+/// The task in the pages' notation.
 pub(crate) fn told(program: &Program) -> wire::Task {
     let shown = |state: &&State| is_shown(state);
     let states = program.states.iter().filter(shown).filter(|state| !is_within_routine(program, state)).take(MOST);
@@ -33,17 +33,17 @@ pub(crate) fn told(program: &Program) -> wire::Task {
     }
 }
 
-/// Without the task.
+/// The answer without a task.
 pub(crate) fn unknown(note: String) -> wire::Task {
     wire::Task { note, ..wire::Task::default() }
 }
 
-/// What does or decides something. The others are made of these.
+/// States that do or decide something are shown. The others contain these.
 fn is_shown(state: &State) -> bool {
     state.is_routine() || matches!(state.kind, StateKind::Action { .. } | StateKind::Condition { .. })
 }
 
-/// It is executed as a part of a routine, which is one node.
+/// Whether a state is executed as part of a routine, which is one node.
 fn is_within_routine(program: &Program, state: &State) -> bool {
     let mut around = state.parent.map(|id| program.state(id));
     while let Some(outer) = around {
@@ -68,9 +68,9 @@ fn add_flows(program: &Program, state: &State, flows: &mut BTreeSet<Flow>) {
     for (slot, expression) in state.expressions() {
         let from = sources(program, state, expression, 0);
         let (to, kind) = match slot {
-            // The outputs and variables of what contains others are looked up by whoever reads them.
+            // Outputs and variables of a containing state are resolved by their readers.
             Slot::Output(_) | Slot::Variable(_) => continue,
-            // What it comes to decides which of those inside there are; the others stand behind those where each visit begins.
+            // Its value decides which inner states exist; later states depend on those at the beginning of each visit.
             Slot::Collection | Slot::While => (entries(program, state), "condition"),
             _ if is_shown(state) => (vec![state.id], "data"),
             _ => continue,
@@ -82,7 +82,7 @@ fn add_flows(program: &Program, state: &State, flows: &mut BTreeSet<Flow>) {
     }
 }
 
-/// The states that are shown of those inside one, however deep; of a state that is shown nothing inside is.
+/// The shown states inside a state, at any depth; a shown state hides those inside it.
 fn inside(program: &Program, state: &State) -> Vec<StateId> {
     let mut found = Vec::new();
     let mut open: Vec<StateId> = state.children().collect();
@@ -97,7 +97,7 @@ fn inside(program: &Program, state: &State) -> Vec<StateId> {
     found
 }
 
-/// The states that are shown where what a state contains begins.
+/// The shown states with which the content of a state begins.
 fn entries(program: &Program, state: &State) -> Vec<StateId> {
     let first = state.lists().into_iter().filter_map(|list| list.first().copied());
     let entry = |id: StateId| {
@@ -107,7 +107,7 @@ fn entries(program: &Program, state: &State) -> Vec<StateId> {
     first.flat_map(entry).collect()
 }
 
-/// The states that are shown whose results an expression in a state is made of.
+/// The shown states whose results an expression in a state depends on.
 fn sources(program: &Program, state: &State, expression: &Expr, depth: usize) -> BTreeSet<StateId> {
     let mut found = BTreeSet::new();
     if depth > MOST_DEPTH {
@@ -164,7 +164,7 @@ mod tests {
             task.flows.iter().any(|flow| flow.from == from && flow.to == to && flow.kind == kind)
         };
         assert!(has("for_box/plan_approach", "for_box/move_approach", "data"), "{:?}", task.flows);
-        // How many boxes there are is known when the table is segmented.
+        // The number of boxes is known when the table has been segmented.
         assert!(has("segment_table", "for_box/detect_pose", "condition"), "{:?}", task.flows);
         assert!(task.flows.iter().all(|flow| flow.from != flow.to));
         let stops = |path: &str| task.stops.iter().any(|stop| stop == path);

@@ -1,4 +1,4 @@
-//! A fold as the pages know it. Pure: the same fold gives the same frame.
+//! Makes frames for the pages from a fold. Pure: the same fold gives the same frame.
 
 use crate::fold::{Fold, News};
 use crate::{logs, wire};
@@ -10,21 +10,21 @@ use ratn_report::timeline::{Activity, Ending, Instance, Job, Stage, Timeline, Wa
 use ratn_task_control::control::{Awaiting, RunStatus};
 use std::collections::BTreeMap;
 
-/// Sentences in one answer.
+/// Maximum number of waiting reasons in one answer.
 const MOST_WAITING: usize = 100;
-/// Breakpoints that are told of; a run has no more.
+/// Maximum number of breakpoints sent; a run has no more.
 const MOST_BREAKPOINTS: usize = 256;
-/// Instances in the queue that are told of.
+/// Maximum number of queued instances sent.
 const MOST_QUEUED: usize = 200;
-/// Of an instance so many stages, jobs, waits and invalidations, the last ones.
+/// Maximum number of stages, jobs, waits and invalidations per instance, the last ones.
 const MOST_STAGES: usize = 12;
 const MOST_JOBS: usize = 8;
 const MOST_WAITS: usize = 4;
 const MOST_BEHIND: usize = 4;
-/// A longer text of a user is cut.
+/// Maximum length of a user's text; a longer one is truncated.
 const MOST_CHARACTERS: usize = 400;
 
-/// What has changed, and the run as a whole. Of `about` it says in any case why it waits.
+/// The changes, and the run as a whole. The reason why `about` waits is included in any case.
 pub(crate) fn frame(fold: &Fold, news: &News, about: Option<InstanceId>) -> wire::Frame {
     let run = &fold.run;
     let changed = news.changed.iter().filter_map(|id| run.instance(*id));
@@ -144,7 +144,7 @@ fn wait(wait: &Wait) -> wire::Wait {
     }
 }
 
-/// Who has asked for resources has a cause that can be seen; the others stand behind those.
+/// Instances that have requested resources come first, because their cause can be seen.
 fn waiting(run: &Timeline, about: Option<InstanceId>) -> Vec<wire::Waiting> {
     let told = |one: &Instance| {
         let sentence = cut(&run.explain(one.id)?);
@@ -191,7 +191,7 @@ fn kinds(run: &Timeline, held: &[wire::Held]) -> Vec<wire::Kind> {
         .collect()
 }
 
-/// What the states of a run wait for by themselves.
+/// What the waiting states of a run wait for.
 pub(crate) fn awaits(status: &RunStatus) -> Vec<wire::Awaits> {
     let told = |one: &Awaiting| {
         let (kind, text, choices) = match &one.awaited {
@@ -204,7 +204,7 @@ pub(crate) fn awaits(status: &RunStatus) -> Vec<wire::Awaits> {
     status.awaits.iter().take(MOST_WAITING).map(told).collect()
 }
 
-/// Before which states a run says that it pauses.
+/// The breakpoints that a run reports.
 pub(crate) fn breakpoints(status: &RunStatus) -> Vec<String> {
     cut_all(&status.breakpoints)
 }
@@ -218,7 +218,7 @@ fn last<T>(mut all: Vec<T>, most: usize) -> Vec<T> {
     all
 }
 
-/// At most so many characters.
+/// Truncates to the maximum number of characters.
 fn cut(text: &str) -> String {
     match text.char_indices().nth(MOST_CHARACTERS) {
         Some((end, _)) => format!("{}…", &text[..end]),

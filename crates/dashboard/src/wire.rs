@@ -1,14 +1,14 @@
-//! What the pages are told, in JSON: the one contract between this crate and `web/`.
+//! The JSON format of the answers to the pages: the one contract between this crate and `web/`.
 //!
-//! Each type stands here once; `web/src/wire.ts` is written from it ([`typescript`]), and a test says when it is not what this file gives.
-//! Moments and lengths are the robot's seconds since the start of the run. Every text may come from a user and is shown as text, never as
-//! anything else.
+//! Each type is defined here once; `web/src/wire.ts` is generated from it ([`typescript`]), and a test reports if that file is outdated.
+//! Times and durations are in seconds of robot time since the start of the run. Every text may come from a user and is shown as plain text,
+//! never as markup.
 
 use serde::Serialize;
 
-/// A type that the pages know.
+/// A type that is part of the format.
 trait Wire {
-    /// As TypeScript writes it.
+    /// The type in TypeScript.
     fn typescript() -> String;
 }
 
@@ -38,7 +38,7 @@ impl<T: Wire> Wire for Vec<T> {
     }
 }
 
-/// Structs with their fields, as Rust and as TypeScript.
+/// Defines structs with their fields, in Rust and in TypeScript.
 macro_rules! wire {
     ($($(#[doc = $doc:literal])+ $name:ident { $($(#[doc = $field_doc:literal])+ $field:ident: $kind:ty,)+ })+) => {
         $(
@@ -55,7 +55,7 @@ macro_rules! wire {
             }
         )+
 
-        /// All of it as a module of TypeScript.
+        /// All types as a TypeScript module.
         pub fn typescript() -> String {
             let mut text = String::from("// Written from crates/dashboard/src/wire.rs; do not edit (RATN_WRITE_WIRE=1 and its test write it).\n");
             $(

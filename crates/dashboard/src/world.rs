@@ -1,7 +1,7 @@
-//! The world of a run as its log tells it: the facts of the root and who wrote them, the latest changes, and what projections show
-//! that the root does not. Pure: it takes lines and says what is known.
+//! The world of a run from its log: the facts of the root with their writers, the latest changes, and how projections differ from the root.
+//! Pure: it takes lines.
 //!
-//! It is not the world pool's word: what others write is in the log once the run has heard of it.
+//! It is not the state of the world pool: changes from outside are in the log only when the run has heard of them.
 
 use crate::wire;
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
@@ -11,17 +11,17 @@ use ratn_model::value::Value;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// The latest changes that are kept.
+/// Maximum number of changes kept.
 const MOST_HISTORY: usize = 2_000;
-/// Facts, changes and projected changes that are told at once.
+/// Maximum number of facts, changes and projected changes sent at once.
 const MOST_TOLD: usize = 1_000;
-/// A longer value is cut.
+/// Maximum length of a value; a longer one is truncated.
 const MOST_CHARACTERS: usize = 240;
-/// Who wrote what was there when the run began, and what others changed.
+/// The writers of facts that existed when the run began, and of changes from outside.
 const AT_THE_START: &str = "before the run";
 const OUTSIDE: &str = "somebody else";
 
-/// Facts and who wrote them.
+/// The facts and their writers.
 #[derive(Debug, Default)]
 pub(crate) struct World {
     revision: Revision,
@@ -45,7 +45,7 @@ struct Projection {
     writers: Vec<Arc<str>>,
 }
 
-/// Who writes, and when that becomes real.
+/// A writer, and when its changes become real.
 struct Writing {
     writer: Arc<str>,
     at_s: f64,
@@ -53,7 +53,7 @@ struct Writing {
 }
 
 impl World {
-    /// Takes the next line.
+    /// Applies the next line.
     pub(crate) fn apply(&mut self, line: &LogLine) {
         let at_s = line.at.seconds();
         match &line.entry {
@@ -92,7 +92,7 @@ impl World {
         }
     }
 
-    /// As the pages know it: the facts whose key, value or writer has `filter` in it.
+    /// The world in the pages' notation: the facts whose key, value or writer contains `filter`.
     pub(crate) fn told(&self, filter: &str, path: impl Fn(InstanceId) -> String) -> wire::World {
         let filter = filter.to_lowercase();
         let all = self.facts.iter().map(|(key, known)| wire::Fact {
@@ -188,7 +188,7 @@ impl World {
     }
 }
 
-/// A value as a text that fits a table.
+/// A value as a text that fits into a table.
 fn shown(value: &Value) -> String {
     let text = value.to_string();
     match text.char_indices().nth(MOST_CHARACTERS) {

@@ -1,11 +1,11 @@
-//! The event log: one JSON object per line, every event that the executive was given and every command that it gave.
+//! The event log: one JSON object per line, for every event that the executive got and every command that it gave.
 //!
-//! It is the single source of Gantt charts, statistics, replay and resume, so each line is on its way to the file before anything of the
-//! commands of its event leaves the process, and on the disk where they cannot be undone. Its writer holds a lock on it: nobody else
-//! writes it meanwhile. Reading says which line is wrong and why; a torn last line (the writer was killed) is left out and named.
+//! It is the single source of Gantt charts, statistics, replay and resume. So each line is written to the file before any command of its
+//! event leaves the process, and synced to disk if the commands cannot be undone. The writer holds a lock on the file: no other process
+//! writes it meanwhile. A reader reports which line is wrong and why; a torn last line (the writer was killed) is ignored and named.
 //!
-//! What is too long for one line, as the beginning of a run in a large world, stands in several, in pieces of its text (`pieces`). Readers
-//! get it in one, and count the lines as they are in the file.
+//! An entry that is too long for one line, for example the start of a run in a large world, is split into several lines (`pieces`). Readers
+//! get it as one entry, and count the lines of the file.
 
 mod parts;
 mod pieces;
@@ -21,47 +21,48 @@ use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-/// A longer line is not written by any task; whoever wrote it is not `ratn`. Tests take less time with shorter ones.
+/// Maximum length of a line. No task makes a longer one, so a longer line was not written by `ratn`. Tests use a smaller limit to be
+/// faster.
 const MAX_LINE_BYTES: usize = if cfg!(test) { 1 << 20 } else { 16 << 20 };
-/// An event or a command that is longer, in all its pieces, is not written: whoever reads it has it in memory.
+/// Maximum length of an event or a command, all pieces together: a reader has all of it in memory.
 const MAX_ENTRY_BYTES: usize = 8 * MAX_LINE_BYTES;
-/// Room that is kept for the next lines, however long the last ones were.
+/// Capacity of the buffer that is kept for the next lines, however long the last ones were.
 const USUAL_BYTES: usize = 64 << 10;
-/// A run whose log grows beyond this is ended rather than filling the disk.
+/// Maximum size of a log: a run whose log would grow beyond it is ended, so that it does not fill the disk.
 const MAX_LOG_BYTES: u64 = 4 << 30;
 
 /// Why an event log cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum LogError {
-    /// The operating system refuses it.
+    /// A call of the operating system failed.
     #[error("cannot {what} the event log {}", path.display())]
     Io {
-        /// What was tried.
+        /// The operation.
         what: &'static str,
         /// The log.
         path: PathBuf,
-        /// Why it failed.
+        /// The cause.
         source: std::io::Error,
     },
-    /// A new log would replace a file that has something in it.
+    /// A new log would replace a file that is not empty.
     #[error("{} is there already, nothing is written over it", path.display())]
     There {
         /// The file.
         path: PathBuf,
     },
-    /// Another process writes it.
+    /// Another process writes the log.
     #[error("the event log {} is being written by a run that is under way", path.display())]
     UnderWay {
         /// The log.
         path: PathBuf,
     },
-    /// It has reached its bound.
+    /// The log has reached its maximum size.
     #[error("the event log {} would grow beyond {MAX_LOG_BYTES} bytes; the run ends here", path.display())]
     TooLong {
         /// The log.
         path: PathBuf,
     },
-    /// An event or a command would be longer than a reader takes.
+    /// An event or a command exceeds what a reader accepts.
     #[error(
         "the {what} has {bytes} bytes in the event log {}, and at most {MAX_ENTRY_BYTES} can be read again{}; the run ends here, and nothing \
          is done that follows from it",
@@ -72,12 +73,12 @@ pub enum LogError {
     TooMuchAtOnce {
         /// The log.
         path: PathBuf,
-        /// Which event or command, as it is named there.
+        /// The event or command, by its name in the log.
         what: String,
-        /// How long it is.
+        /// Its length in bytes.
         bytes: usize,
     },
-    /// A line does not read.
+    /// A line cannot be read.
     #[error("{}:{line}: not a line of an event log: {reason}", path.display())]
     Foreign {
         /// The file.
@@ -87,17 +88,17 @@ pub enum LogError {
         /// What is wrong with it.
         reason: String,
     },
-    /// A line that was looked at has no moment.
+    /// A line that was looked up has no time.
     #[error("{} at byte {offset}: not a line of an event log: {reason}", path.display())]
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// Where the line begins.
+        /// The offset at which the line begins.
         offset: u64,
         /// What is wrong with it.
         reason: String,
     },
-    /// It has no whole line.
+    /// The log has no complete line.
     #[error("{} has no whole line: an event log begins with the event `started`", path.display())]
     Empty {
         /// The file.
@@ -110,20 +111,20 @@ pub enum LogError {
 pub struct LogWriter {
     path: PathBuf,
     file: File,
-    /// How many bytes and lines are written.
+    /// Number of bytes and lines written.
     written: u64,
     lines: usize,
-    /// How many lines are noted, and not yet written.
+    /// Number of lines that are buffered and not yet written.
     noted: usize,
-    /// It is on a disk, so that it can be made safe there.
+    /// Whether the log is a file on disk, which can be synced.
     on_disk: bool,
-    /// What was behind the last whole line is away.
+    /// Whether the torn line at the end has been cut off.
     is_cut: bool,
-    /// What is noted.
+    /// The buffered lines.
     text: Vec<u8>,
 }
 
-/// A [`LogLine`] as it is written: nothing is copied for it.
+/// A [`LogLine`] in the form in which it is written, without copies.
 #[derive(Serialize)]
 struct Written<'a, T> {
     at: Timestamp,
@@ -132,7 +133,7 @@ struct Written<'a, T> {
 }
 
 impl LogWriter {
-    /// Creates the file; one with something in it stays as it is.
+    /// Creates the file; a file that is not empty stays unchanged.
     pub fn create(path: &Path) -> Result<Self, LogError> {
         let mut writer = LogWriter::open(path, OpenOptions::new().write(true).create(true).truncate(false), "create")?;
         let length = writer.file.metadata().map_err(|source| writer.io(source))?.len();
@@ -141,41 +142,41 @@ impl LogWriter {
         }
         writer.is_cut = true;
         if writer.on_disk {
-            // The file's name has to be safe, too.
+            // The file's directory entry has to be synced, too.
             let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
             File::open(folder).and_then(|folder| folder.sync_all()).map_err(|source| writer.io(source))?;
         }
         Ok(writer)
     }
 
-    /// For a log that is gone on with: from here on nobody else is its writer. [`LogWriter::go_on_behind`] says where.
+    /// Opens a log in order to continue it: from now on no other process can write it. [`LogWriter::go_on_behind`] sets the position.
     pub fn go_on(path: &Path) -> Result<Self, LogError> {
         let mut writer = LogWriter::open(path, OpenOptions::new().append(true), "go on with")?;
         writer.written = writer.file.metadata().map_err(|source| writer.io(source))?.len();
         Ok(writer)
     }
 
-    /// Goes on behind the whole lines of what was read. A torn line is cut off before the first line is written.
+    /// Continues after the complete lines of the log that was read. A torn line is cut off before the first line is written.
     pub fn go_on_behind(&mut self, log: &Log) {
         (self.written, self.lines) = (log.whole, log.read);
     }
 
-    /// Where the log is.
+    /// The log's path.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Whether it is a file, which can be read again.
+    /// Whether the log is a file on disk, which can be read again.
     pub fn is_on_disk(&self) -> bool {
         self.on_disk
     }
 
-    /// How many bytes it has.
+    /// Number of bytes in the log.
     pub fn written(&self) -> u64 {
         self.written
     }
 
-    /// How many lines it has.
+    /// Number of lines in the log.
     pub fn lines(&self) -> usize {
         self.lines
     }
@@ -210,20 +211,20 @@ impl LogWriter {
         Ok(())
     }
 
-    /// Writes what happened and what was decided then, and hands it to the operating system. Where it cannot be written so that it reads
-    /// again, nothing of it is written.
+    /// Writes an event and the commands that were decided on it, and hands them to the operating system. If they cannot be written in a
+    /// readable form, nothing is written.
     pub fn append(&mut self, at: Timestamp, event: &Event, commands: &[Command]) -> Result<(), LogError> {
         self.note(at, event, commands)?;
         self.write()
     }
 
-    /// Writes what was decided on the last event, as [`LogWriter::append`] does.
+    /// Writes further commands decided on the last event, as [`LogWriter::append`] does.
     pub fn append_commands(&mut self, at: Timestamp, commands: &[Command]) -> Result<(), LogError> {
         self.add(at, None, commands)?;
         self.write()
     }
 
-    /// As [`LogWriter::append`], and keeps it until [`LogWriter::write`] hands it over with what was noted before and after it.
+    /// As [`LogWriter::append`], but buffers the lines until [`LogWriter::write`].
     pub fn note(&mut self, at: Timestamp, event: &Event, commands: &[Command]) -> Result<(), LogError> {
         self.add(at, Some(event), commands)
     }
@@ -245,16 +246,16 @@ impl LogWriter {
         added
     }
 
-    /// The file, to make safe what was written while more is written; `None` where it is on no disk.
+    /// A second handle of the file, to sync it while more is written; `None` if the log is not on disk.
     ///
     /// # Errors
-    /// Where the system has no room for one more open file.
+    /// The system cannot open another file.
     pub fn handle(&self) -> Result<Option<File>, LogError> {
         let handle = || self.file.try_clone().map_err(|source| self.io(source));
         self.on_disk.then(handle).transpose()
     }
 
-    /// Returns once everything written so far outlives a loss of power.
+    /// Returns when everything written so far would survive a loss of power.
     pub fn make_durable(&mut self) -> Result<(), LogError> {
         if self.on_disk {
             self.file.sync_data().map_err(|source| self.io(source))?;
@@ -280,7 +281,7 @@ impl LogWriter {
         Ok(())
     }
 
-    /// Hands to the operating system what was noted.
+    /// Hands the buffered lines to the operating system.
     pub fn write(&mut self) -> Result<(), LogError> {
         if self.noted == 0 {
             return Ok(());
@@ -299,16 +300,16 @@ impl LogWriter {
     }
 }
 
-/// What an event log says.
+/// The content of an event log.
 #[derive(Debug)]
 pub struct Log {
-    /// The whole lines that were read.
+    /// The complete lines that were read.
     pub lines: Vec<LogLine>,
-    /// How many lines are before these and were not read.
+    /// Number of earlier lines, which were not read.
     pub before: usize,
-    /// The number of its last line if that is torn, which is not among the others.
+    /// The number of the last line if it is torn; that line is not in `lines`.
     pub torn: Option<usize>,
-    /// How many bytes and lines it has up to the end of what was read.
+    /// Number of bytes and lines in the log up to the end of what was read.
     pub whole: u64,
     read: usize,
 }
@@ -316,7 +317,7 @@ pub struct Log {
 /// Reads a whole event log.
 ///
 /// # Errors
-/// [`LogError`] names the line.
+/// [`LogError`], which names the line.
 pub fn read(path: &Path) -> Result<Log, LogError> {
     let log = read_from(path, 0, 0, usize::MAX)?;
     if log.lines.is_empty() {
@@ -325,7 +326,7 @@ pub fn read(path: &Path) -> Result<Log, LogError> {
     Ok(log)
 }
 
-/// Reads what is behind so many bytes, which are so many lines.
+/// Reads what follows the first `bytes`, which are `lines` lines.
 ///
 /// # Errors
 /// As [`read`].
@@ -356,12 +357,12 @@ pub struct Tail {
 }
 
 impl Tail {
-    /// Of a log that may not be there yet.
+    /// Follows a log that may not exist yet.
     pub fn of(path: &Path) -> Tail {
         Tail { path: path.to_owned(), bytes: 0, lines: 0 }
     }
 
-    /// The whole lines that were written since the last call.
+    /// The complete lines that were written since the last call.
     ///
     /// # Errors
     /// As [`read`].
@@ -375,7 +376,7 @@ impl Tail {
     }
 }
 
-/// Reads an event log line by line, holding one of them. A torn last line is left out.
+/// Reads an event log line by line, with one entry in memory. A torn last line is ignored.
 #[derive(Debug)]
 pub struct Lines {
     path: PathBuf,
@@ -388,28 +389,28 @@ pub struct Lines {
 }
 
 impl Lines {
-    /// Of a whole log.
+    /// Reads a whole log.
     ///
     /// # Errors
-    /// Where it cannot be read.
+    /// The log cannot be read.
     pub fn of(path: &Path) -> Result<Lines, LogError> {
         Lines::open(path, 0, 0)
     }
 
-    /// What is behind so many bytes, which are so many lines: where a line begins.
+    /// Reads what follows the first `bytes`, which are `lines` lines: a line must begin there.
     ///
     /// # Errors
-    /// Where it cannot be read.
+    /// The log cannot be read.
     pub fn behind(path: &Path, bytes: u64, lines: usize) -> Result<Lines, LogError> {
         Lines::open(path, bytes, lines)
     }
 
-    /// How many bytes and lines are before the next line.
+    /// Number of bytes and lines before the next line.
     pub fn position(&self) -> (u64, usize) {
         (self.whole, self.read)
     }
 
-    /// The number of its last line if that is torn; known once all others were read.
+    /// The number of the last line if it is torn; known when all others have been read.
     pub fn torn(&self) -> Option<usize> {
         self.torn
     }
@@ -424,7 +425,7 @@ impl Lines {
         Ok(Lines { path, reader, read: before, whole: bytes, torn: None, text: Vec::new(), is_over: false })
     }
 
-    /// The next event or command, all pieces of it together.
+    /// The next event or command, with all its pieces joined.
     fn entry(&mut self) -> Result<Option<LogLine>, LogError> {
         let first = self.read + 1;
         let Some(mut length) = self.line(first)? else { return Ok(None) };
@@ -452,7 +453,7 @@ impl Lines {
         Ok(Some(parsed))
     }
 
-    /// Reads a whole line of this number; how long it is.
+    /// Reads a complete line, which has this number; returns its length.
     fn line(&mut self, line: usize) -> Result<Option<u64>, LogError> {
         self.text.clear();
         let limit = MAX_LINE_BYTES as u64 + 1;
@@ -488,7 +489,7 @@ impl Iterator for Lines {
     }
 }
 
-/// The path of a state, of the path of one of its visits: `place_all[2]/plan_transfer` → `place_all/plan_transfer`
+/// The path of a state, from the path of one of its visits: `place_all[2]/plan_transfer` → `place_all/plan_transfer`
 pub fn without_visits(path: &str) -> String {
     let mut depth = 0_usize;
     let mut number = false;
@@ -503,7 +504,7 @@ pub fn without_visits(path: &str) -> String {
         .collect()
 }
 
-/// What a line calls itself, `event finished`: this stands at its beginning.
+/// The name of an entry, for example `event finished`, from the beginning of its line.
 fn named(line: &[u8]) -> String {
     let beginning = String::from_utf8_lossy(&line[..line.len().min(100)]);
     let named = ["event", "command"].iter().find_map(|what| {
@@ -513,7 +514,7 @@ fn named(line: &[u8]) -> String {
     named.unwrap_or_else(|| "line".to_owned())
 }
 
-/// serde's message for an untagged enum says nothing; this one says what the line claims to be.
+/// An error message for a line: serde's message for an untagged enum says nothing, this one names the entry's claimed kind.
 fn explain(text: &[u8], error: &serde_json::Error) -> String {
     let Ok(value) = serde_json::from_slice::<serde_json::Value>(text) else {
         return format!("not JSON: {error}");
@@ -569,7 +570,7 @@ mod tests {
         let file = tempfile::NamedTempFile::new().unwrap();
         let mut log = LogWriter::create(file.path()).unwrap();
         let command = Command::Note(Note::Retired { instance: InstanceId(1) });
-        // It has a time of its own.
+        // This command has a time of its own.
         let wake = Command::Wake { at: Timestamp(7) };
         log.append(Timestamp(0), &started(), &[command.clone(), wake.clone()]).unwrap();
         let Log { lines, torn, .. } = read(file.path()).unwrap();
@@ -654,7 +655,7 @@ mod tests {
         std::fs::write(file.path(), format!("{first}\n{{\"at\":1,")).unwrap();
         let log = read(file.path()).unwrap();
         assert_eq!((log.lines.len(), log.torn), (1, Some(2)));
-        // Who goes on with it writes over the torn line.
+        // A writer that continues the log overwrites the torn line.
         let mut writer = LogWriter::go_on(file.path()).unwrap();
         writer.go_on_behind(&log);
         writer.append(Timestamp(2), &Event::Resumed { share: None }, &[]).unwrap();
@@ -673,7 +674,7 @@ mod tests {
         let (bytes, lines) = (log.written(), log.lines());
         let refused = log.append(Timestamp(1), &says(MAX_ENTRY_BYTES - around + 1), &[]).unwrap_err();
         assert!(refused.to_string().starts_with("the event signalled has 8388609 bytes"), "{refused}");
-        // Nor is an event there without what was decided on it.
+        // An event is not written without the commands decided on it.
         let end = Command::End {
             outcome: "aborted".to_owned(),
             outputs: Default::default(),
@@ -692,7 +693,7 @@ mod tests {
         let mut log = LogWriter::create(file.path()).unwrap();
         let mut large = started();
         if let Event::Started { world, .. } = &mut large {
-            // What stands in quotation marks, what is written with several bytes, and what would end a line.
+            // Characters that need escapes, that have several bytes, and that would end a line.
             let text = "a\"\\\u{1}\n漢".repeat(100);
             let fact = |i| FactKey { predicate: "at".to_owned(), arguments: vec![Term::Int(i)] };
             world.extend((0..2_000).map(|i| (fact(i), Value::String(text.clone()))));
@@ -709,7 +710,7 @@ mod tests {
         let entries = [LogEntry::Event(large), LogEntry::Command(Command::Wake { at: Timestamp(7) })];
         assert!(all.lines.iter().map(|line| &line.entry).eq(&entries));
         assert_eq!((all.whole, all.read), (log.written(), log.lines()));
-        // The writer was killed within it.
+        // The writer was killed within the entry.
         let whole = log.written();
         log.append(Timestamp(6), &says(MAX_LINE_BYTES), &[]).unwrap();
         let lines = log.lines();

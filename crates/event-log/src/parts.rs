@@ -1,8 +1,8 @@
-//! Where in a long log which moment is: of every 4 MiB the first whole line, and when that was.
+//! An index of a long log by time: for every 4 MiB, the offset and the time of the first complete line.
 //!
-//! It reads one line of each part and the end of the log, so a log of 1 GiB is indexed by reading a few hundred lines. It keeps an
-//! offset and a moment of each part and nothing of the lines, except how the first one ends: it says which run the log is of, so another log
-//! that takes the place of this one is known as another.
+//! The index reads one line per part and the end of the log, so a log of 1 GiB is indexed by reading a few hundred lines. It keeps an
+//! offset and a time per part and no lines, except the end of the first one: that end names the run of the log, so another log that
+//! replaces this file is noticed.
 
 use crate::{LogError, MAX_LINE_BYTES, pieces};
 use ratn_model::time::Timestamp;
@@ -12,26 +12,26 @@ use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
-/// How much of a log a part is.
+/// Size of a part of the log.
 const PART_BYTES: u64 = 4 << 20;
-/// So much of the end of a log is looked at first for its last line.
+/// Number of bytes at the end of a log in which the last line is searched first.
 const END_BYTES: u64 = 64 << 10;
-/// So much of the end of the first line is kept: the id of the run stands there.
+/// Number of bytes kept of the end of the first line: the run's id is there.
 const MARK_BYTES: u64 = 1 << 10;
 
-/// The parts of a log, as far as it was written when it was looked at.
+/// The parts of a log, as far as it was written at the last look.
 #[derive(Debug)]
 pub struct Parts {
     path: PathBuf,
     part_bytes: u64,
-    /// Of each part the byte at which its first line begins, and when that was.
+    /// For each part the offset at which its first line begins, and that line's time.
     begin: Vec<(u64, Timestamp)>,
     length: u64,
     last: Timestamp,
     mark: Option<Mark>,
 }
 
-/// What a log is known by while it grows: its file, and how its first line ends.
+/// Identifies a log while it grows: its file, and the end of its first line.
 #[derive(Debug)]
 struct Mark {
     device: u64,
@@ -41,7 +41,7 @@ struct Mark {
 }
 
 impl Mark {
-    /// Of a log whose first line has so many bytes.
+    /// The mark of a log whose first line has this length.
     fn of(file: &File, is: &Metadata, first: u64) -> std::io::Result<Mark> {
         let length = first.min(MARK_BYTES);
         let mut mark =
@@ -58,17 +58,17 @@ impl Mark {
     }
 }
 
-/// Of a line only when it was.
+/// The time of a line.
 #[derive(Deserialize)]
 struct Stamp {
     at: Timestamp,
 }
 
 impl Parts {
-    /// Of a log, which may have no whole line yet.
+    /// The parts of a log, which may have no complete line yet.
     ///
     /// # Errors
-    /// Where it cannot be read, or a line that is looked at has no moment.
+    /// The log cannot be read, or a line that is looked up has no time.
     pub fn of(path: &Path) -> Result<Parts, LogError> {
         Parts::of_size(path, PART_BYTES)
     }
@@ -83,8 +83,8 @@ impl Parts {
         Parts { path, part_bytes, begin: Vec::new(), length: 0, last: Timestamp(0), mark: None }
     }
 
-    /// Looks at what was written since. Whether it is the same log as before: one that is shorter than it was, and another one that has its name now,
-    /// is indexed anew.
+    /// Indexes what was written since. Returns whether it is the same log as before: a log that is shorter than before, or another file
+    /// under this name, is indexed anew.
     ///
     /// # Errors
     /// As [`Parts::of`].
@@ -105,7 +105,7 @@ impl Parts {
         }
         while self.begin.len() as u64 * self.part_bytes < length {
             let from = self.begin.len() as u64 * self.part_bytes;
-            // What is longer than a part is gone through once.
+            // An entry that is longer than a part is read only once.
             if let Some(same) = self.begin.last().copied().filter(|(offset, _)| *offset >= from) {
                 self.begin.push(same);
                 continue;
@@ -118,18 +118,18 @@ impl Parts {
         Ok(is_same)
     }
 
-    /// How many bytes it has, a torn line at its end included.
+    /// Number of bytes in the log, including a torn line at its end.
     pub fn length(&self) -> u64 {
         self.length
     }
 
-    /// When its last whole line was.
+    /// Time of the last complete line.
     pub fn last(&self) -> Timestamp {
         self.last
     }
 
-    /// Where to begin to read for what happened until a moment, so that at least `bytes` before it are read: the byte at which a line
-    /// begins, and when that was. The start of the log where there is not so much before it.
+    /// Where to begin reading for what happened until `moment`, with at least `bytes` before it: the offset at which a line begins, and its
+    /// time. The start of the log if there are fewer bytes before it.
     pub fn before(&self, moment: Timestamp, bytes: u64) -> (u64, Timestamp) {
         let reached = self.begin.partition_point(|(_, at)| *at <= moment);
         let back = usize::try_from(bytes.div_ceil(self.part_bytes)).unwrap_or(usize::MAX);
@@ -137,7 +137,7 @@ impl Parts {
         if part == 0 { (0, Timestamp(0)) } else { self.begin[part] }
     }
 
-    /// How long the first event is, all its pieces together; `None` where it is not whole yet.
+    /// Length of the first event, all its pieces together; `None` if it is not complete yet.
     fn first_length(&self, reader: &mut impl BufRead) -> Result<Option<u64>, LogError> {
         let Some(first) = self.line(reader)? else { return Ok(None) };
         let mut length = first.len() as u64;
@@ -153,13 +153,13 @@ impl Parts {
         Ok(Some(length))
     }
 
-    /// The first whole line that begins at a byte or behind it, and that is no piece of something that began before it.
+    /// The first complete line that begins at offset `from` or later and is not a further piece of an earlier entry.
     fn first_behind(&self, file: &mut File, from: u64) -> Result<Option<(u64, Timestamp)>, LogError> {
         let mut offset = from.saturating_sub(1);
         file.seek(SeekFrom::Start(offset)).map_err(|source| self.io(source))?;
         let mut reader = BufReader::new(file);
         if from > 0 {
-            // The rest of the line before; where that ends with the byte before this one, it is empty.
+            // The rest of the previous line; empty if that line ends exactly before `from`.
             let Some(rest) = self.line(&mut reader)? else { return Ok(None) };
             offset += rest.len() as u64;
         }
@@ -195,7 +195,7 @@ impl Parts {
         }
     }
 
-    /// A whole line with its end; `None` where there is none.
+    /// A complete line with its line end; `None` if there is none.
     fn line(&self, reader: &mut impl BufRead) -> Result<Option<Vec<u8>>, LogError> {
         let mut line = Vec::new();
         let limit = MAX_LINE_BYTES as u64 + 1;
@@ -254,7 +254,7 @@ mod tests {
                 let (offset, at) = parts.before(moment, 100);
                 assert!(at <= moment, "{at:?} {moment:?}");
                 assert!(offset == 0 || first_at(file.path(), offset) == at);
-                // So much is before it, and not much more.
+                // At least this much is before it, and not much more.
                 let line = moment.seconds().min(500.0) * 40.0;
                 assert!(offset as f64 <= (line - 100.0).max(0.0) + 200.0, "{offset} for {moment:?} by {size}");
             }
@@ -283,14 +283,14 @@ mod tests {
         let mut parts = Parts::of_size(file.path(), 64).unwrap();
         writeln!(file, r#"{{"at":4000000000,"event":"woken"}}"#).unwrap();
         assert!(parts.look().unwrap() && parts.look().unwrap());
-        // In the same file, of the same length.
+        // Another log in the same file, of the same length.
         let other = std::fs::read_to_string(file.path())
             .unwrap()
             .replace("\"seed\":1", "\"seed\":2")
             .replace("at\":4", "at\":9");
         std::fs::write(file.path(), &other).unwrap();
         assert_eq!((parts.look().unwrap(), parts.last()), (false, Timestamp::from_seconds(9.0)));
-        // The same in another file, and then less of it.
+        // The same log in another file, and then a shorter one.
         let copy = file.path().with_extension("copy");
         std::fs::write(&copy, &other).unwrap();
         std::fs::rename(copy, file.path()).unwrap();

@@ -1,4 +1,5 @@
-//! An event or a command that is too long for one line: its text in pieces, a line each, in order and with nothing between them.
+//! Splits an event or a command that is too long for one line into pieces of its text: one per line, in order and with no other line
+//! between.
 //!
 //! ```text
 //!   {"at":0,"part":1,"of":3,"text":"{\\"at\\":0,\\"event\\":\\"started\\",…"}
@@ -12,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::io::{Error, Result};
 
-/// The text of a piece: each byte of JSON has at most two in a text of JSON, and there is room for the rest of the line.
+/// Length of the text of a piece: escaping in JSON at most doubles it, and there is room for the rest of the line.
 const PIECE_BYTES: usize = MAX_LINE_BYTES / 2 - 1_024;
 
 #[derive(Serialize, Deserialize)]
@@ -23,7 +24,7 @@ struct Piece<'a> {
     text: Cow<'a, str>,
 }
 
-/// Writes an event or a command in pieces; how many lines those are.
+/// Writes an event or a command in pieces; returns the number of lines.
 pub(super) fn write(out: &mut Vec<u8>, at: Timestamp, mut text: &str) -> Result<usize> {
     let mut pieces = Vec::new();
     while !text.is_empty() {
@@ -39,18 +40,18 @@ pub(super) fn write(out: &mut Vec<u8>, at: Timestamp, mut text: &str) -> Result<
     Ok(pieces.len())
 }
 
-/// Whether a line is a piece of something.
+/// Whether a line is a piece.
 pub(super) fn is_one(line: &[u8]) -> bool {
     let behind_time = line.iter().position(|byte| *byte == b',').map(|comma| &line[comma + 1..]);
     behind_time.is_some_and(|rest| rest.starts_with(br#""part":"#))
 }
 
-/// Whether a line is a piece behind the first one.
+/// Whether a line is a piece other than the first one.
 pub(super) fn goes_on(line: &[u8]) -> bool {
     is_one(line) && serde_json::from_slice::<Piece<'_>>(line).is_ok_and(|piece| piece.part > 1)
 }
 
-/// What pieces are together.
+/// The joined text of pieces.
 #[derive(Default)]
 pub(super) struct Joined {
     text: String,
@@ -59,7 +60,7 @@ pub(super) struct Joined {
 }
 
 impl Joined {
-    /// Adds the next piece. Whether it was the last one.
+    /// Adds the next piece. Returns whether it was the last one.
     pub(super) fn add(&mut self, line: &[u8]) -> std::result::Result<bool, String> {
         let piece: Piece<'_> = serde_json::from_slice(line).map_err(|error| {
             format!("not part {} of {} of an event or a command: {error}", self.parts + 1, self.of.max(1))

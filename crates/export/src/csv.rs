@@ -1,4 +1,4 @@
-//! A table of the instances, as RFC 4180 has it: a row each, in the order in which they left the window.
+//! A table of the instances as CSV (RFC 4180): one row per instance, in the order in which they left the window.
 
 use super::Writer;
 use ratn_event_log::without_visits;

@@ -1,7 +1,7 @@
-//! Graphs for Graphviz and Mermaid: the network of instances, each with what it waited for, or the states in their hierarchy.
+//! Graphs for Graphviz and Mermaid: the network of instances, each with what it waited for, or the hierarchy of states.
 //!
-//! The network is written as it comes. In Graphviz's language a cluster can be gone on with, so the hierarchy is in it; in Mermaid's it
-//! cannot, and the paths say it. The task is drawn at the end: there are as many states as the task has.
+//! The network is written line by line. In Graphviz's language a cluster can be continued later, so the graph shows the hierarchy; in
+//! Mermaid's language it cannot, and the paths show it. The task graph is written at the end: it has as many nodes as the task has states.
 
 use super::Writer;
 use ratn_event_log::without_visits;
@@ -13,23 +13,23 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::io::{self, Write};
 
-/// In which language.
+/// The language of the graph.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Language {
-    /// Graphviz's.
+    /// Graphviz's language, DOT.
     Dot,
-    /// Mermaid's.
+    /// Mermaid's language.
     Mermaid,
 }
 
-/// Why one waited for another.
+/// Why an instance waited for another one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Bond {
-    /// It began when the other had a result.
+    /// It began when the other one had a result.
     Result,
-    /// Its projection showed what the other writes.
+    /// Its projection shows an effect of the other one.
     World,
-    /// The other held what it wanted.
+    /// The other one held a resource that it wanted.
     Resource,
 }
 
@@ -51,7 +51,7 @@ impl Bond {
     }
 }
 
-/// A node as both languages draw it.
+/// A node, for both languages.
 struct Node {
     name: String,
     label: String,
@@ -71,7 +71,7 @@ struct Network<W> {
     out: W,
     language: Language,
     has_begun: bool,
-    /// Those that are written and can come again.
+    /// Edges that were written and could occur again.
     edges: BTreeSet<(InstanceId, InstanceId, Bond)>,
 }
 
@@ -110,7 +110,7 @@ impl<W: Write> Network<W> {
                 is_faded: one.squashed,
             };
             writeln!(self.out, "{}", placed(self.language, &one.path, &node))?;
-            // Nothing more is said of it: its edges cannot come again.
+            // There is no more news about this instance: its edges cannot occur again.
             let of_it: Vec<_> = self
                 .edges
                 .range((one.id, InstanceId(0), Bond::Result)..(InstanceId(one.id.0 + 1), InstanceId(0), Bond::Result))
@@ -157,7 +157,7 @@ struct Task<W> {
     edges: BTreeMap<(String, String, Bond), usize>,
 }
 
-/// Of one state.
+/// The visits of one state.
 #[derive(Default)]
 struct Visits {
     all: usize,
@@ -215,7 +215,7 @@ impl<W: Write> Writer for Task<W> {
             writeln!(self.out, "{}", placed(self.language, state, &node))?;
         }
         for ((from, to, bond), times) in &self.edges {
-            // A state that wrote what is real was perhaps never seen.
+            // The state that wrote may not occur in the log.
             if let (Some(from), Some(to)) = (numbers.get(from.as_str()), numbers.get(to.as_str())) {
                 let label = if *times == 1 { bond.name().to_owned() } else { format!("{} × {times}", bond.name()) };
                 writeln!(self.out, "{}", edge(self.language, &format!("s{from}"), &format!("s{to}"), *bond, &label))?;
@@ -255,7 +255,7 @@ fn tail(out: &mut impl Write, language: Language) -> io::Result<()> {
     }
 }
 
-/// A node, in Graphviz's language in the clusters of its path.
+/// A node; in Graphviz's language, within the clusters of its path.
 fn placed(language: Language, path: &str, node: &Node) -> String {
     if language == Language::Mermaid {
         let label = format!("{}\n{}", path, node.label.split_once('\n').map_or("", |(_, rest)| rest));
@@ -282,7 +282,7 @@ fn placed(language: Language, path: &str, node: &Node) -> String {
     )
 }
 
-/// A cluster is known by a number that follows from its path (FNV-1a): the paths themselves would take the square of their depth.
+/// The id of a cluster is a hash of its path (FNV-1a): writing the paths themselves would take the square of their depth.
 const FNV_BASIS: u64 = 0xcbf2_9ce4_8422_2325;
 const FNV_PRIME: u64 = 0x0100_0000_01b3;
 
@@ -302,12 +302,12 @@ fn edge(language: Language, from: &str, to: &str, bond: Bond, label: &str) -> St
     }
 }
 
-/// A quoted string of Graphviz's language. Only the quote and the backslash mean something in it.
+/// A quoted string in Graphviz's language. Only the quote and the backslash are special there.
 fn dot_text(text: &str) -> String {
     format!("\"{}\"", readable(text).replace('\\', "\\\\").replace('"', "\\\"").replace('\n', "\\n"))
 }
 
-/// What stands in quotes in Mermaid: characters that mean something there, and those of HTML, as numbers.
+/// A quoted text in Mermaid: characters that are special there or in HTML, as numeric entities.
 fn mermaid_text(text: &str) -> String {
     let mut out = String::new();
     for c in readable(text).chars() {
@@ -338,7 +338,7 @@ mod tests {
             Node { name: "n".to_owned(), label: "n".to_owned(), fill: "#eee", is_dashed: false, is_faded: false };
         let drawn = |depth: usize| placed(Language::Dot, &vec!["a"; depth].join("/"), &node);
         assert!(drawn(20_000).len() < 20_000 * 60);
-        // What is in the same state is in the same cluster, and only that.
+        // Nodes in the same state are in the same cluster, and only those.
         let (one, other) = (placed(Language::Dot, "a/b/x", &node), placed(Language::Dot, "a/c/x", &node));
         let clusters = |text: &str| {
             text.split(' ').filter(|word| word.starts_with("cluster_")).map(str::to_owned).collect::<Vec<_>>()

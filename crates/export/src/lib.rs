@@ -1,9 +1,9 @@
-//! Event logs in the forms that the tools of the field open.
+//! Exports event logs to the formats of common tools.
 //!
-//! Pure writers over the one projection of a log (`ratn_report::timeline`): lines come in, bytes go out, and what is kept does not grow
-//! with the log. Each form is a file of its own that says who reads it. They need no task file and no system that runs.
+//! Pure writers over one fold of a log (`ratn_report::timeline`): lines in, bytes out, with memory that does not grow with the log. Each
+//! format is a source file of its own, which names the tools that read it. No task file and no running system is needed.
 //!
-//! What is exported is what the log says. Time is the robot's, laid on the moment at which the run began.
+//! The export contains what the log says. Times are robot time, added to the wall time at which the run began.
 
 mod csv;
 mod graph;
@@ -17,15 +17,15 @@ use ratn_executive::protocol::LogLine;
 use ratn_report::timeline::{Changed, Timeline};
 use std::io::{self, Write};
 
-/// Of the instances that have left the window so many are known, for what still refers to them.
+/// Number of instances kept after they have left the window, because later lines may refer to them.
 const KEPT: usize = 256;
 
-/// A form.
+/// An export format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     /// A trace for ui.perfetto.dev.
     Perfetto,
-    /// Spans as OTLP/JSON, a request a line.
+    /// Spans as OTLP/JSON, one request per line.
     Otlp,
     /// A recording for Foxglove and Rerun.
     Mcap,
@@ -42,33 +42,33 @@ pub enum Format {
 pub enum Drawing {
     /// The instances, and what each waited for.
     Network,
-    /// The states in their hierarchy, all visits of a state as one.
+    /// The hierarchy of states, all visits of a state as one node.
     Task,
 }
 
 /// Why nothing, or not everything, was exported.
 #[derive(Debug, thiserror::Error)]
 pub enum ExportError<E> {
-    /// The log does not read on.
+    /// A line of the log cannot be read.
     #[error(transparent)]
     Log(E),
-    /// The target does not take it.
+    /// The output cannot be written.
     #[error("cannot write the export")]
     Write(#[source] io::Error),
 }
 
-/// One form under way.
+/// A writer of one format.
 trait Writer {
-    /// After each line: the run since then, and what the line changed.
+    /// Called after each line, with the run so far, and what the line changed.
     fn line(&mut self, line: &LogLine, run: &Timeline, changed: &Changed) -> io::Result<()>;
-    /// After the last one. What was still held or kept is in `changed`.
+    /// Called after the last line. `changed` contains what was still held or kept.
     fn end(&mut self, run: &Timeline, changed: &Changed) -> io::Result<()>;
 }
 
-/// Writes a log in a form.
+/// Writes a log in a format.
 ///
 /// # Errors
-/// Where a line cannot be read, or what is made of it not be written. What was written until then is incomplete.
+/// A line cannot be read, or the output not be written. What was written until then is incomplete.
 pub fn export<E>(
     format: Format,
     lines: impl IntoIterator<Item = Result<LogLine, E>>,
@@ -94,8 +94,8 @@ pub fn export<E>(
     out.flush().map_err(ExportError::Write)
 }
 
-/// Nanoseconds since 1970.
+/// A moment of the run in nanoseconds since 1970.
 fn unix_ns(run: &Timeline, at_s: f64) -> u64 {
-    // A moment of a run is never negative.
+    // Times of a run are never negative.
     run.began_unix_ms.saturating_mul(1_000_000).saturating_add((at_s.max(0.0) * 1e9).round() as u64)
 }

@@ -1,7 +1,6 @@
-//! The spans of a run while it goes on: those of its log's export, each as soon as its instance has left the window.
+//! The spans of a running run: the same as in its log's export, each as soon as its instance has left the window.
 //!
-//! They are laid on wall time, as those of the daemons are that the run calls: a second of a robot that goes `speed` times as fast is
-//! so much shorter.
+//! Times are wall time, as in the spans of the daemons that the run calls: at a speed of `speed`, a second of robot time lasts 1/`speed` s.
 
 use super::otlp::{about, root, spans_of};
 use super::{KEPT, otlp};
@@ -19,12 +18,12 @@ pub struct Live {
 }
 
 impl Live {
-    /// Of a run whose first moment was then, on a robot that goes `speed` times as fast.
+    /// Follows a run that began at this wall time, with a robot that is `speed` times as fast.
     pub fn new(from_unix_ns: u64, speed: f64) -> Live {
         Live { run: Timeline::following(KEPT), from_unix_ns, speed }
     }
 
-    /// What has ended by an event, and by what was decided then.
+    /// The spans that are complete after an event and the commands decided on it.
     pub fn follow(&mut self, at: Timestamp, event: &Event, commands: &[Command]) -> Vec<Span> {
         let event = LogEntry::Event(event.clone());
         let entries = std::iter::once(event).chain(commands.iter().cloned().map(LogEntry::Command));
@@ -35,7 +34,7 @@ impl Live {
         spans
     }
 
-    /// What has ended by a line of the run's log.
+    /// The spans that are complete after a line of the run's log.
     pub fn line(&mut self, line: &LogLine) -> Vec<Span> {
         let changed = self.run.apply(line);
         let mut spans = Vec::new();
@@ -43,7 +42,7 @@ impl Live {
         spans
     }
 
-    /// What was still there at the end, and the run itself.
+    /// The spans of what was still open at the end, and of the run itself.
     pub fn end(&mut self) -> Vec<Span> {
         let changed = self.run.close();
         let mut spans = Vec::new();

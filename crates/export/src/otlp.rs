@@ -1,8 +1,8 @@
-//! Spans for OpenTelemetry: one for the run, one for each instance in it, one for each attempt and each wait for resources in that.
+//! Spans for OpenTelemetry: one for the run, in it one per instance, and in that one per attempt and per wait for resources.
 //!
-//! OTLP/JSON, one `ExportTraceServiceRequest` a line: the form of the collector's `otlpjsonfile` receiver, and each line can be sent to
-//! `/v1/traces` as it is. What an instance waited for is linked. Ids follow from the run, so the same log gives the same spans, and those
-//! that a run sends while it goes on ([`crate::live`]) are the same ones.
+//! OTLP/JSON, one `ExportTraceServiceRequest` per line: the format of the collector's `otlpjsonfile` receiver; each line can be sent to
+//! `/v1/traces` as it is. What an instance waited for is linked. Ids are derived from the run, so the same log gives the same spans, equal
+//! to those that a run sends live ([`crate::live`]).
 
 use super::{Writer, unix_ns};
 use ratn_executive::protocol::LogLine;
@@ -15,7 +15,7 @@ use ratn_report::timeline::{Cause, Changed, Ending, Instance, Job, Timeline, Wai
 use std::collections::BTreeMap;
 use std::io::{self, Write};
 
-/// As many spans are one request.
+/// Number of spans per request.
 const BATCH: usize = 512;
 
 pub(crate) struct Otlp<W> {
@@ -23,7 +23,7 @@ pub(crate) struct Otlp<W> {
     spans: Vec<Span>,
 }
 
-/// When a moment of a run was, in nanoseconds since 1970.
+/// Converts a moment of a run to nanoseconds since 1970.
 pub(crate) type Laid<'a> = &'a dyn Fn(f64) -> u64;
 
 impl<W: Write> Otlp<W> {
@@ -62,12 +62,12 @@ impl<W: Write> Writer for Otlp<W> {
     }
 }
 
-/// What is said of a run.
+/// Attributes of a run.
 pub(crate) fn about(run: &Timeline) -> [(&'static str, String); 3] {
     [("ratn.task", run.task.clone()), ("ratn.mode", mode_name(run.mode).to_owned()), ("ratn.run", run.run.clone())]
 }
 
-/// The run's own span.
+/// The root span of the run.
 pub(crate) fn root(run: &Timeline, laid: Laid<'_>) -> Span {
     let outcome = run.outcome.clone().unwrap_or_else(|| "unfinished".to_owned());
     let error = (outcome != SUCCESS).then(|| run.reason.clone());
@@ -136,7 +136,7 @@ fn wait_span(run: &Timeline, laid: Laid<'_>, of: u64, wait: &Wait) -> Span {
     Span { links, ..span }
 }
 
-/// What it waited for: results of others, and what its projection shows of them.
+/// Links to what the instance waited for: results of others, and effects that its projection shows.
 fn links(one: &Instance) -> Vec<Link> {
     let mut by_id: BTreeMap<InstanceId, &'static str> = BTreeMap::new();
     for phase in one.awaited() {

@@ -1,8 +1,8 @@
-//! A trace of track events for ui.perfetto.dev: a track for each resource, on it who holds it and what is done with it; one more for
-//! waits. A flow leads from each result to what had waited for it, and ends at once where that was discarded before it ran.
+//! A trace of track events for ui.perfetto.dev: a track per resource, with its holders and their work; one more for waits. A flow leads
+//! from each result to the instances that had waited for it; it ends at once if such an instance was discarded before it ran.
 //!
-//! Where several hold a resource at once it has a track for each. The parts of a trace are behind each other in the file, so it is
-//! written as it comes; a reader sorts it by time.
+//! If several instances hold a resource at once, it has a track for each. The packets are written in the order of the log; a reader sorts
+//! them by time.
 
 use super::wire::perfetto::track_event::Type;
 use super::wire::perfetto::{DebugAnnotation, ProcessDescriptor, Trace, TracePacket, TrackDescriptor, TrackEvent};
@@ -19,10 +19,10 @@ use std::collections::BTreeMap;
 use std::io::{self, Write};
 use std::sync::Arc;
 
-/// The run is the only process, and the only sequence of packets.
+/// The run is the only process, with one sequence of packets.
 const PROCESS: u64 = 1;
 const SEQUENCE: u32 = 1;
-/// Names mean what they meant before: there are none to forget.
+/// The sequence begins without earlier interned names.
 const INCREMENTAL_STATE_CLEARED: u32 = 1;
 const ELSEWHERE: &str = "no resource";
 const WAITING: &str = "waiting for resources";
@@ -30,9 +30,9 @@ const WAITING: &str = "waiting for resources";
 pub(crate) struct Perfetto<W> {
     out: W,
     lanes: BTreeMap<Arc<str>, Lanes>,
-    /// What is held, by resource and holder: its lane, and whether what is done with it is on that lane.
+    /// The holdings, by resource and holder: the lane, and whether the work is shown on that lane.
     held: Vec<Held>,
-    /// Where what runs is shown.
+    /// Where the work of a running instance is shown.
     at_work: BTreeMap<InstanceId, Work>,
     ends: Option<Ends>,
     flows: u64,
@@ -40,19 +40,19 @@ pub(crate) struct Perfetto<W> {
     arriving: BTreeMap<InstanceId, (u64, u64)>,
 }
 
-/// A slice of work that is open.
+/// An open slice of work.
 #[derive(Clone, Copy)]
 struct Work {
     track: u64,
-    /// Its lane, where it holds no resource.
+    /// The lane, if it holds no resource.
     elsewhere: Option<usize>,
 }
 
-/// The instance that the last event is about has a result: the end of its slice is written behind what that leads to.
+/// The instance of the last event has a result: the end of its slice is written after the consequences of the result.
 struct Ends {
     instance: InstanceId,
     track: u64,
-    /// What is said at the end; none once it is written.
+    /// The annotations of the end; `None` once they are written.
     said: Option<Vec<DebugAnnotation>>,
 }
 
@@ -87,7 +87,7 @@ impl<W: Write> Perfetto<W> {
         })
     }
 
-    /// A lane of a track, described where it is new.
+    /// A lane of a track; writes its descriptor if it is new.
     fn lane(&mut self, name: &Arc<str>, from_s: f64, to_s: f64) -> io::Result<(usize, u64)> {
         let (lane, is_new) = self.lanes.entry(name.clone()).or_default().take(from_s, to_s);
         let uuid = number_of(&format!("{name} {lane}"));
@@ -127,7 +127,7 @@ impl<W: Write> Perfetto<W> {
         let is_it = |held: &Held| held.resource == one.resource && held.instance == one.instance;
         let Some(at) = self.held.iter().position(is_it) else { return Ok(()) };
         let Held { resource, lane, track, .. } = self.held.remove(at);
-        // What is still done with it ends with it: slices of a track are within each other.
+        // Work that still uses it ends with it: slices of a track have to be nested.
         let at_work = self.at_work.iter().find(|(_, work)| work.track == track).map(|(id, _)| *id);
         if let Some(id) = at_work {
             self.ends_work(run, id, one.to_s, Vec::new())?;
@@ -171,7 +171,7 @@ impl<W: Write> Perfetto<W> {
         self.event(run, at_s, Type::SliceEnd, track, event)
     }
 
-    /// What the last event has led to is written: its instance has ended.
+    /// The consequences of the last event are written: now its instance's slice ends.
     fn ends_at_last(&mut self, run: &Timeline, at_s: f64) -> io::Result<()> {
         let Some((id, said)) = self.ends.as_mut().and_then(|ends| Some((ends.instance, ends.said.take()?))) else {
             return Ok(());
@@ -179,7 +179,7 @@ impl<W: Write> Perfetto<W> {
         self.ends_work(run, id, at_s, said)
     }
 
-    /// An instance has stopped waiting because of the result of another.
+    /// An instance has stopped waiting because of the result of another one.
     fn flows(&mut self, run: &Timeline, id: InstanceId, at_s: f64) -> io::Result<()> {
         let Some(last) = run.instance(id).and_then(|one| one.phases.last()) else { return Ok(()) };
         let Cause::Result(of, path) = &last.ended_by else { return Ok(()) };
@@ -197,7 +197,7 @@ impl<W: Write> Perfetto<W> {
         self.event(run, at_s, Type::Instant, track, event)
     }
 
-    /// What a flow would have led to does not begin any more.
+    /// Ends the flow to an instance that will not begin any more.
     fn leads_nowhere(&mut self, run: &Timeline, one: &Instance) -> io::Result<()> {
         let Some((flow, track)) = self.arriving.remove(&one.id) else { return Ok(()) };
         let name = format!("{} was not begun", one.path);

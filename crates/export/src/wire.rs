@@ -7,6 +7,6 @@ pub(crate) mod perfetto {
 
 pub(crate) mod foxglove {
     include!("generated/foxglove.rs");
-    /// With what they import, as an encoded `FileDescriptorSet`.
+    /// The schemas with their imports, as an encoded `FileDescriptorSet`.
     pub(crate) const DESCRIPTORS: &[u8] = include_bytes!("generated/foxglove_descriptors.bin");
 }

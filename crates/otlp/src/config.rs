@@ -1,32 +1,32 @@
-//! The section `[service.otlp]`.
+//! The config section `[service.otlp]`.
 
 use hyper::Uri;
 use hyper::header::{HeaderName, HeaderValue};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Where spans go. All keys are optional; without `endpoint` nothing is recorded.
+/// Where spans are sent. All keys are optional; without `endpoint` nothing is recorded.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct OtlpConfig {
-    /// The collector, as `http://host:4318`; `/v1/traces` is added to it.
+    /// The collector, for example `http://host:4318`; `/v1/traces` is appended.
     pub endpoint: Option<String>,
-    /// Headers of every request, as `authorization = "Bearer …"`.
+    /// Headers of every request, for example `authorization = "Bearer …"`.
     pub headers: BTreeMap<String, String>,
-    /// A request that takes longer has failed, in milliseconds.
+    /// Time limit of a request, in milliseconds.
     pub timeout_ms: u64,
 }
 
-/// What is wrong with the section.
+/// A fault in the section.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Fault {
-    /// The key, from `[service]`.
+    /// The key, relative to `[service]`.
     pub key: String,
     /// The rule that it breaks, and what to write.
     pub rule: String,
 }
 
-/// Where to, as it is used.
+/// The collector's address in the form in which it is used.
 #[derive(Debug, Clone)]
 pub(crate) struct Target {
     pub(crate) uri: Uri,
@@ -44,12 +44,12 @@ impl Default for OtlpConfig {
 }
 
 impl OtlpConfig {
-    /// What is wrong with it, if anything.
+    /// The first fault of the config, if any.
     pub fn fault(&self) -> Option<Fault> {
         self.target().err()
     }
 
-    /// Where to; `None` where it is off.
+    /// The collector's address; `None` if sending is off.
     pub(crate) fn target(&self) -> Result<Option<Target>, Fault> {
         let fault = |key: String, rule: &str| Fault { key, rule: rule.to_owned() };
         if !(1..=60_000).contains(&self.timeout_ms) {

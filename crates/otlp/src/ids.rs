@@ -1,24 +1,24 @@
-//! The ids of a run's trace and of its spans. They follow from the run: the export of its log, the run itself and the daemons that it
-//! calls come to the same, and no message has to say them.
+//! The ids of a run's trace and of its spans. They are derived from the run: the export of its log, the run itself and the daemons that it
+//! calls get the same ids, and no message has to carry them.
 
-/// The run's own span; those of instances are behind it.
+/// The id of the run's own span; ids of instances are larger.
 pub const ROOT: u64 = 1;
 
-/// Jobs and waits have ids of their own, behind their instance's: of one instance there are at most so many.
+/// Ids of jobs and waits follow that of their instance: an instance can have at most this many.
 pub const PARTS: u64 = 1 << 16;
 
-/// The trace of a run.
+/// The trace id of a run.
 pub fn trace(run: &str, task: &str, seed: u64, began_unix_ms: u64) -> u128 {
     let named = format!("{run} {task} {seed}");
     (u128::from(number_of(&named)) << 64) | u128::from(began_unix_ms)
 }
 
-/// The span of an instance of a run. Number 0 stands for no instance: what the run does itself is of its own span.
+/// The span id of an instance of a run. Number 0 stands for no instance: work of the run itself belongs to the root span.
 pub fn instance(instance: u64) -> u64 {
     if instance == 0 { ROOT } else { (instance + 1).wrapping_mul(PARTS) }
 }
 
-/// A number that is always the same for a name (FNV-1a), never 0.
+/// A hash of a name (FNV-1a), never 0.
 pub fn number_of(name: &str) -> u64 {
     let hash = name
         .bytes()

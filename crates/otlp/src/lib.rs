@@ -1,11 +1,11 @@
-//! Spans for OpenTelemetry: what one is, its ids ([`ids`]), its two forms (OTLP/JSON for files, protobuf for `/v1/traces`), and the
+//! Spans for OpenTelemetry: their data, their ids ([`ids`]), the two formats (OTLP/JSON for files, protobuf for `/v1/traces`), and the
 //! sender of a process ([`start`], [`sender`]).
 //!
 //! ```text
 //!   record(span) ──bounded queue──▶ thread "otlp": batches ──POST /v1/traces──▶ collector
 //! ```
-//! Whoever records a span never waits: a span that has no room in the queue, or that the collector does not take, is dropped and counted.
-//! There is one sender in a process, as there is one log. Without one ([`sender`] is `None`) nothing is recorded.
+//! Recording a span never waits: a span that finds no room in the queue, or that the collector does not accept, is dropped and counted. A
+//! process has one sender, as it has one log. Without one ([`sender`] is `None`) nothing is recorded.
 
 mod config;
 pub mod ids;

@@ -1,4 +1,4 @@
-//! One request to a collector, over a connection of its own.
+//! Sends one request to a collector, over a connection of its own.
 
 use super::config::Target;
 use bytes::Bytes;
@@ -9,7 +9,7 @@ use hyper_util::rt::TokioIo;
 use std::io;
 use tokio::net::TcpStream;
 
-/// Why a collector did not take what it was sent.
+/// Why a collector did not accept a request.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum PostError {
     #[error("cannot connect: {0}")]
@@ -40,7 +40,7 @@ pub(crate) async fn post(target: &Target, body: Vec<u8>) -> Result<(), PostError
         request = request.header(name, value);
     }
     let request = request.body(Full::new(Bytes::from(body))).map_err(PostError::Malformed)?;
-    // The connection works beside, and is dropped with this request.
+    // The connection is driven concurrently, and dropped with this request.
     let answered = async {
         let answer = requests.send_request(request).await.map_err(PostError::Broken)?;
         if answer.status().is_success() { Ok(()) } else { Err(PostError::Refused(answer.status())) }

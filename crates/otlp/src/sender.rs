@@ -1,6 +1,6 @@
-//! The sender of a process: a bounded queue, and a thread that sends what is in it in batches.
+//! The sender of a process: a bounded queue, and a thread that sends its content in batches.
 //!
-//! What cannot be sent is dropped and counted, and is not tried again: spans tell what went on, and nobody's work may depend on them.
+//! Spans that cannot be sent are dropped and counted, without a retry: no work may depend on them.
 
 use super::config::{Fault, OtlpConfig, Target};
 use super::post::{PostError, post};
@@ -13,21 +13,21 @@ use std::time::Duration;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 
-/// Spans that were not sent yet.
+/// Maximum number of spans in the queue, …
 const QUEUE: usize = 4_096;
-/// … of at most so many bytes together.
+/// … and their maximum size in bytes together.
 const QUEUE_BYTES: usize = 16 << 20;
-/// As many spans are one request, …
+/// Maximum number of spans in a request, …
 const BATCH: usize = 512;
-/// … or as many as have so many bytes: collectors take 4 MiB, unless somebody tells them otherwise, …
+/// … and maximum size of a request in bytes: collectors accept 4 MiB by default, …
 const BATCH_BYTES: usize = 1 << 20;
-/// … or what came in this time.
+/// … and maximum time for which spans are collected for a request.
 const PAUSE: Duration = Duration::from_millis(500);
-/// What is queued at the end of a run is sent in this time, …
+/// Time limit for sending the queue at the end of a run, …
 pub const END_OF_RUN: Duration = Duration::from_secs(2);
-/// … and at the end of a daemon or a worker, which its manager waits for, in this.
+/// … and at the end of a daemon or a worker, for which its manager waits.
 pub const END_OF_SERVER: Duration = Duration::from_millis(500);
-/// The scope of what a process tells of itself.
+/// The instrumentation scope of a process's own spans.
 const SCOPE: &str = "ratn";
 
 static SENDER: OnceLock<Sender> = OnceLock::new();
@@ -36,13 +36,13 @@ static SENDER: OnceLock<Sender> = OnceLock::new();
 #[derive(Debug, Clone)]
 pub struct Sender {
     queue: mpsc::Sender<Message>,
-    /// How many bytes are in the queue.
+    /// Number of bytes in the queue.
     bytes: Arc<AtomicUsize>,
     counts: Counts,
     trouble: Arc<Trouble>,
 }
 
-/// Tells once that spans are dropped.
+/// Reports once that spans are dropped.
 struct Trouble {
     collector: String,
     is_said: AtomicBool,
@@ -50,7 +50,7 @@ struct Trouble {
 }
 
 impl Trouble {
-    /// Why the collector does not get them.
+    /// Reports why the collector does not get spans.
     fn say(&self, why: &dyn fmt::Display) {
         if !self.is_said.swap(true, Ordering::Relaxed) {
             (self.say)(&format!(
@@ -68,7 +68,7 @@ impl fmt::Debug for Trouble {
     }
 }
 
-/// How many spans were sent, and how many dropped. Clones count together.
+/// Numbers of spans sent and dropped. Clones share the counters.
 #[derive(Debug, Clone, Default)]
 pub struct Counts(Arc<[AtomicU64; 2]>);
 
@@ -79,12 +79,12 @@ enum Message {
 }
 
 impl Counts {
-    /// Those that a collector has taken.
+    /// Number of spans that the collector has accepted.
     pub fn sent(&self) -> u64 {
         self.0[0].load(Ordering::Relaxed)
     }
 
-    /// Those that no collector has taken, or that found the queue full.
+    /// Number of spans that the collector did not accept, or that found the queue full.
     pub fn dropped(&self) -> u64 {
         self.0[1].load(Ordering::Relaxed)
     }
@@ -100,11 +100,11 @@ pub fn sender() -> Option<&'static Sender> {
     SENDER.get()
 }
 
-/// Starts the sender of this process, where the config says so and none was started before. `resource` says which process it is; `say`
-/// is told once, on the first trouble, that spans are dropped and why.
+/// Starts the sender of this process, if the config asks for it and none was started before. `resource` describes the process; `say` is
+/// called once, at the first failure, with the reason why spans are dropped.
 ///
 /// # Errors
-/// What is wrong with the config.
+/// The fault in the config.
 pub fn start(
     config: &OtlpConfig,
     resource: Vec<(&'static str, String)>,
@@ -135,12 +135,12 @@ impl Sender {
             Ok(runtime) => runtime.block_on(work.send_all(spans)),
             Err(error) => work.trouble.say(&format_args!("this process cannot send any: {error}")),
         };
-        // Without the thread the queue is closed, and everything is dropped.
+        // If the thread cannot be started, the queue is closed, and everything is dropped.
         let _ = std::thread::Builder::new().name("otlp".to_owned()).spawn(sending);
         sender
     }
 
-    /// Takes a span, or drops it where there is no room; never waits.
+    /// Queues a span, or drops it if there is no room; never waits.
     pub fn record(&self, span: Span) {
         let span = span.cut();
         let bytes = span.bytes();
@@ -154,12 +154,12 @@ impl Sender {
         }
     }
 
-    /// How many were sent and dropped until now.
+    /// The numbers of spans sent and dropped so far.
     pub fn counts(&self) -> &Counts {
         &self.counts
     }
 
-    /// Waits until what was recorded before is sent or dropped, for so long at the most.
+    /// Waits until everything recorded before is sent or dropped, at most for `patience`.
     pub async fn flush(&self, patience: Duration) {
         let flushing = async {
             let (done, is_done) = oneshot::channel();
@@ -178,7 +178,7 @@ struct Work {
     target: Target,
     timeout_ms: u64,
     resource: Vec<(&'static str, String)>,
-    /// How many bytes are in the queue.
+    /// Number of bytes in the queue.
     queued: Arc<AtomicUsize>,
     counts: Counts,
     trouble: Arc<Trouble>,
@@ -266,7 +266,7 @@ mod tests {
         (Sender::start(config.target().unwrap().unwrap(), timeout_ms, resource, say), heard)
     }
 
-    /// Answers one request; its head and its body.
+    /// Answers one request; returns its head and its body.
     async fn answer(listener: &TcpListener, status: &str) -> (String, Vec<u8>) {
         let (mut connection, _) = listener.accept().await.unwrap();
         let mut read = Vec::new();
@@ -338,7 +338,7 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let (sender, heard) = to(listener.local_addr().unwrap().port(), 60_000);
         let began = Instant::now();
-        // What is on its way is no longer in the queue.
+        // Spans that are being sent are no longer in the queue.
         let most = (QUEUE + 2 * BATCH) as u64;
         for id in 1..=2 * most {
             sender.record(span(id));
@@ -363,7 +363,7 @@ mod tests {
         let most = QUEUE_BYTES / long(1).cut().bytes();
         (0..2 * most as u64).for_each(|id| sender.record(long(id)));
         let dropped = sender.counts().dropped();
-        // What is on its way is no longer in the queue.
+        // Spans that are being sent are no longer in the queue.
         assert!(dropped + 40 >= most as u64 && dropped <= most as u64, "{dropped} of {most}");
         let flushing = {
             let sender = sender.clone();

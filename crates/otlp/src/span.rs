@@ -3,48 +3,48 @@
 use serde_json::{Value, json};
 
 const ERROR: u32 = 2;
-/// Of a longer text the beginning is sent: a reason may be as long as a message of the wire.
+/// Maximum length of a text in bytes; a longer one is truncated: a reason may be as long as a message on the wire.
 const MAX_TEXT: usize = 4_096;
-/// Of more links the first are sent, as the SDKs of OpenTelemetry do it.
+/// Maximum number of links; further ones are dropped, as the SDKs of OpenTelemetry do.
 const MAX_LINKS: usize = 128;
-/// What a span or a link takes on the wire beside its texts, at the most.
+/// Maximum size of a span or a link on the wire, without its texts.
 const FRAME: usize = 128;
 
-/// A part of a trace that has ended.
+/// A span: a part of a trace that has ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Span {
     /// The trace, never 0.
     pub trace: u128,
-    /// The span in it, never 0.
+    /// The span id, never 0.
     pub id: u64,
-    /// The span that it is a part of.
+    /// The parent span.
     pub parent: Option<u64>,
-    /// What was done.
+    /// The operation.
     pub name: String,
-    /// Where it was done.
+    /// The kind of the span.
     pub kind: Kind,
     /// Nanoseconds since 1970.
     pub from_unix_ns: u64,
     /// Nanoseconds since 1970, not before `from_unix_ns`.
     pub to_unix_ns: u64,
-    /// What is known of it; an empty value says nothing, and is left out.
+    /// Attributes; those with an empty value are omitted.
     pub attributes: Vec<(&'static str, String)>,
-    /// What it waited for, in the same trace: which span, and why.
+    /// What it waited for, in the same trace: the span, and the reason.
     pub links: Vec<Link>,
-    /// What went wrong, if anything did.
+    /// The error, if any.
     pub error: Option<String>,
 }
 
-/// Another span, in the same trace.
+/// A link to another span in the same trace.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Link {
-    /// Which.
+    /// The other span.
     pub to: u64,
     /// The value of `ratn.waited_for`.
     pub waited_for: &'static str,
 }
 
-/// What a span is to its parent, with OTLP's numbers.
+/// The relation of a span to its parent, with OTLP's numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// Work of the same process.
@@ -56,7 +56,7 @@ pub enum Kind {
 /// The name and value of an attribute of a link.
 pub(crate) const WAITED_FOR: &str = "ratn.waited_for";
 
-/// A request with spans as OTLP/JSON.
+/// An OTLP/JSON request with these spans.
 pub fn json_request<'a>(
     resource: &[(&'static str, String)],
     scope: &str,
@@ -72,7 +72,7 @@ pub fn json_request<'a>(
 impl Span {
     fn json(&self) -> Value {
         let trace = format!("{:032x}", self.trace);
-        // Numbers of 64 bits are strings in OTLP/JSON.
+        // 64-bit numbers are strings in OTLP/JSON.
         let mut json = json!({
             "traceId": trace,
             "spanId": hex(self.id),
@@ -96,7 +96,7 @@ impl Span {
         json
     }
 
-    /// With texts and links of bounded length.
+    /// Truncates texts and links to their limits.
     pub(crate) fn cut(mut self) -> Span {
         let values = self.attributes.iter_mut().map(|(_, value)| value);
         values.chain([&mut self.name]).chain(&mut self.error).for_each(cut);
@@ -104,7 +104,7 @@ impl Span {
         self
     }
 
-    /// About how many bytes it takes on the wire.
+    /// Approximate size on the wire, in bytes.
     pub(crate) fn bytes(&self) -> usize {
         let attributes = self.attributes.iter().map(|(key, value)| key.len() + value.len() + FRAME / 4);
         let texts = self.name.len() + self.error.as_ref().map_or(0, String::len) + attributes.sum::<usize>();
@@ -120,12 +120,12 @@ fn cut(text: &mut String) {
     if text.len() > MAX_TEXT {
         text.truncate(text.floor_char_boundary(MAX_TEXT));
         text.push('…');
-        // The queue is bounded in spans.
+        // Release the unused capacity: the queue's limits do not count it.
         text.shrink_to_fit();
     }
 }
 
-/// Those that say something.
+/// The attributes with a value.
 pub(crate) fn said<'a>(attributes: &'a [(&'static str, String)]) -> impl Iterator<Item = (&'static str, &'a str)> {
     attributes.iter().filter(|(_, value)| !value.is_empty()).map(|(key, value)| (*key, value.as_str()))
 }

@@ -1,4 +1,4 @@
-//! The protobuf form: what is needed of `opentelemetry/proto/collector/trace/v1/trace_service.proto` (1.x), by hand.
+//! The protobuf format: the required part of `opentelemetry/proto/collector/trace/v1/trace_service.proto` (1.x), written by hand.
 
 use super::span::{Span, WAITED_FOR, said};
 use prost::Message;
@@ -95,7 +95,7 @@ struct AnyValue {
 
 const ERROR: i32 = 2;
 
-/// An `ExportTraceServiceRequest`.
+/// Encodes an `ExportTraceServiceRequest`.
 pub(crate) fn request(resource: &[(&'static str, String)], scope: &str, spans: &[Span]) -> Vec<u8> {
     let scope_spans =
         ScopeSpans { scope: Some(Scope { name: scope.to_owned() }), spans: spans.iter().map(span).collect() };
@@ -129,33 +129,33 @@ fn key_value((key, value): (&'static str, &str)) -> KeyValue {
     KeyValue { key: key.to_owned(), value: Some(AnyValue { string_value: Some(value.to_owned()) }) }
 }
 
-/// A span as a collector sees it, for tests.
+/// A span as decoded by a collector, for tests.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Decoded {
-    /// `service.name` of its resource.
+    /// `service.name` of the resource.
     pub service: String,
-    /// 32 hex digits.
+    /// The trace id: 32 hex digits.
     pub trace: String,
-    /// 16 hex digits.
+    /// The span id: 16 hex digits.
     pub id: String,
-    /// 16 hex digits, or none.
+    /// The parent's span id: 16 hex digits, or empty.
     pub parent: String,
-    /// What was done.
+    /// The operation.
     pub name: String,
-    /// How long, in nanoseconds from 1970.
+    /// Start and end, in nanoseconds since 1970.
     pub time_unix_ns: (u64, u64),
-    /// What is known of it.
+    /// The attributes.
     pub attributes: Vec<(String, String)>,
-    /// The spans that it waited for.
+    /// The span ids that it waited for.
     pub links: Vec<String>,
-    /// What went wrong.
+    /// The error.
     pub error: Option<String>,
 }
 
-/// Reads the body of a request, as a collector does.
+/// Decodes the body of a request, as a collector does.
 ///
 /// # Errors
-/// Where it is none.
+/// The body is not a valid request.
 pub fn decode(body: &[u8]) -> Result<Vec<Decoded>, prost::DecodeError> {
     let request = Request::decode(body)?;
     let mut spans = Vec::new();

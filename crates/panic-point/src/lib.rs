@@ -1,21 +1,21 @@
-//! Places in the code where a test can make a running process panic, to see that the process then ends and that another one takes its place;
-//! or hang, where the file says [`HANG`].
+//! Points in the code at which a test can make a running process panic, to check that the process then ends and another one takes over; or
+//! hang, if the file contains [`HANG`].
 //!
-//! Each place has a name and calls [`panic_point`]. A process that was started with [`VARIABLE`] panics at a place once the folder that the
-//! variable names has a file of the place's name. The place removes the file first, so the process that is started next goes on.
+//! Each point has a name and calls [`panic_point`]. A process that was started with [`VARIABLE`] panics at a point when the folder in that
+//! variable contains a file with the point's name. The point removes the file first, so that the next process goes on.
 //!
-//! In a build without debug assertions (every release) there are no such places: the function is empty, and the variable is not read.
+//! In a build without debug assertions (every release) the function is empty, and the variable is not read.
 
 /// The environment variable with the folder.
 pub const VARIABLE: &str = "RATN_PANIC_POINTS";
 
-/// What a file says by which a thread hangs at its place instead of panicking.
+/// The content of a file that makes a thread hang at its point instead of panicking.
 pub const HANG: &str = "hang";
 
 /// Panics, or never returns, if a test asks for it; see the module.
 ///
 /// # Panics
-/// In a build with debug assertions, where the folder of [`VARIABLE`] has a file of this name.
+/// In a build with debug assertions, if the folder in [`VARIABLE`] contains a file of this name.
 #[inline]
 pub fn panic_point(name: &str) {
     #[cfg(debug_assertions)]
@@ -44,7 +44,7 @@ mod in_debug_builds {
         }
     }
 
-    /// What the file says, once for each file.
+    /// The content of the file, which is removed.
     pub(super) fn asked_for(folder: &Path, name: &str) -> Option<String> {
         let file = folder.join(name);
         let says = std::fs::read_to_string(&file).ok()?;

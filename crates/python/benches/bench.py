@@ -78,7 +78,7 @@ def run(running: ratn.System, text: str) -> tuple[ratn.Nodes, Any]:
 
 
 def hop(running: ratn.System) -> dict[str, float]:
-    """A chain, each state of the result of the one before: from the begin of one to that of the next."""
+    """A chain in which each state uses the result of the one before: time from the begin of one to that of the next."""
     states = [state("s0", "add", "{ value: 0 }"), *(state(f"s{n}", "add", f"{{ value: s{n - 1}.value }}") for n in range(1, HOPS))]
     nodes, _ = run(running, f"task: hops\nhorizon: {HOPS + 10}\nstates:\n{''.join(states)}")
     began = [node["began_s"] for node in nodes]
@@ -132,7 +132,7 @@ sys.stdin.read()
 
 
 def grpcio(goals: int) -> dict[str, Any]:
-    """Servers of grpcio that add one, each a process, with texts as messages: no leases, no log, no worlds."""
+    """Servers of grpcio that add one, each a process, with texts as messages: without leases, logs and worlds."""
     import grpc
 
     with contextlib.ExitStack() as stack:
@@ -140,7 +140,7 @@ def grpcio(goals: int) -> dict[str, Any]:
         for _ in range(2):
             server = stack.enter_context(subprocess.Popen([sys.executable, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
             assert server.stdin is not None and server.stdout is not None
-            # It ends when its standard input does, which is before it is waited for.
+            # The server ends when its standard input is closed, which happens before the wait for it.
             stack.callback(server.stdin.close)
             channel = stack.enter_context(grpc.insecure_channel(f"127.0.0.1:{server.stdout.readline().strip()}"))
             calls.append(channel.unary_unary("/bench.Bench/Add"))

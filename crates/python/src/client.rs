@@ -25,32 +25,32 @@ use std::time::Duration;
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::{Mutex as AsyncMutex, mpsc};
 
-/// A resource manager that opens no session for so long is not there.
+/// Time limit for opening a session.
 const SESSION_PATIENCE: Duration = Duration::from_secs(5);
-/// How often Python is asked for a signal (Ctrl-C) while something is waited for.
+/// Interval of checks for a Python signal (Ctrl-C) during a wait.
 const SIGNALS: Duration = Duration::from_millis(100);
-/// The kind of the room for a projection.
+/// The kind of resource that is the room for a projection.
 const WORLD_MODEL: &str = "WorldModel";
-/// What the resource manager is told where nobody says how long to wait: thirty years.
+/// The time limit sent to the resource manager if the caller gives none: about thirty years.
 const FOR_EVER: Duration = Duration::from_secs(1_000_000_000);
-/// Revisions that Python has not asked for yet; more wait in the world pool.
+/// Maximum number of revisions buffered for Python; further ones wait in the world pool.
 const MAX_UPDATES: usize = 64;
 
-/// What speaks to the system whose endpoint files are in a directory.
+/// A client of the system whose endpoint files are in a directory.
 #[pyclass(frozen, module = "ratn")]
 pub(crate) struct Client {
     runtime: Arc<OwnRuntime>,
     channels: Channels,
     resource_manager: Endpoint,
     world: WorldClient,
-    /// Waited for only without Python's lock: whoever has it waits for Python's lock.
+    /// Waited for only without Python's lock, because its holder may wait for Python's lock.
     session: AsyncMutex<Option<Arc<Held>>>,
     is_closed: AtomicBool,
 }
 
-/// A runtime, which works in the process that made it only.
+/// A tokio runtime, usable only in the process that made it.
 struct OwnRuntime {
-    /// Until this is dropped.
+    /// `None` only while this is dropped.
     runtime: Option<Runtime>,
     process: Process,
 }
@@ -69,13 +69,13 @@ impl OwnRuntime {
 impl Drop for OwnRuntime {
     fn drop(&mut self) {
         if !self.process.is_here() {
-            // A fork would wait for threads that it does not have.
+            // In a fork, dropping it would wait for threads that do not exist there.
             std::mem::forget(self.runtime.take());
         }
     }
 }
 
-/// A session, and what asks in its name.
+/// A session, and the client in its name.
 struct Held {
     session: Session,
     client: ResourceClient,
@@ -88,7 +88,7 @@ enum NoSession {
 }
 
 impl Client {
-    /// As long as it is not closed.
+    /// The runtime, unless the client is closed.
     fn open(&self) -> PyResult<&OwnRuntime> {
         match self.is_closed.load(Ordering::Relaxed) {
             true => Err(Error::new_err("this system is closed: open one with `ratn.System(…)`")),
@@ -96,11 +96,11 @@ impl Client {
         }
     }
 
-    /// The session of the process, which the first who asks for it opens; whoever asks meanwhile waits.
+    /// The session of the process. The first caller opens it; other callers wait meanwhile.
     fn held(&self, py: Python<'_>) -> PyResult<Arc<Held>> {
         let opened = async {
             let mut kept = self.session.lock().await;
-            // One whose id is another caller's comes to nothing any more.
+            // A session whose id belongs to another caller will never be alive again.
             if let Some(held) = kept.as_ref().filter(|held| !held.session.state().borrow().taken) {
                 return Ok(Arc::clone(held));
             }
@@ -117,7 +117,7 @@ impl Client {
     }
 }
 
-/// Waits without Python's lock, and hears Ctrl-C meanwhile.
+/// Waits without Python's lock, and reacts to Ctrl-C meanwhile.
 fn wait_for<T: Send>(
     py: Python<'_>,
     runtime: &OwnRuntime,
@@ -126,10 +126,10 @@ fn wait_for<T: Send>(
     wait(py, runtime, work)?.map_err(|error| of_call(&error))
 }
 
-/// As [`wait_for`], for anything.
+/// As [`wait_for`], for any result.
 fn wait<T: Send>(py: Python<'_>, runtime: &OwnRuntime, work: impl Future<Output = T> + Send) -> PyResult<T> {
     let runtime = runtime.here()?;
-    // What is given up may have something to say in the runtime.
+    // A future that is dropped may need the runtime.
     let _within = runtime.enter();
     let mut work = Box::pin(work);
     loop {
@@ -141,7 +141,7 @@ fn wait<T: Send>(py: Python<'_>, runtime: &OwnRuntime, work: impl Future<Output 
     }
 }
 
-/// The end of a `with` block: where something was raised inside, that is what counts.
+/// The end of a `with` block: an exception raised inside has priority.
 fn left(released: PyResult<bool>, exception: &Bound<'_, PyTuple>) -> PyResult<bool> {
     let has_raised = exception.get_item(0).is_ok_and(|kind| !kind.is_none());
     match released {
@@ -150,7 +150,7 @@ fn left(released: PyResult<bool>, exception: &Bound<'_, PyTuple>) -> PyResult<bo
     }
 }
 
-/// What went wrong after something that counts more: it is told where Python tells what nobody can be given. Ctrl-C is never beside something else.
+/// Reports an error that comes after a more important one as an unraisable exception. Ctrl-C is never reported this way.
 fn beside(py: Python<'_>, error: PyErr) -> PyResult<()> {
     if error.is_instance_of::<PyKeyboardInterrupt>(py) {
         return Err(error);
@@ -159,7 +159,7 @@ fn beside(py: Python<'_>, error: PyErr) -> PyResult<()> {
     Ok(())
 }
 
-/// A fact with its value; without one it is gone.
+/// The change that sets a fact to a value; `None` deletes it.
 fn change(fact_text: &str, value: &Bound<'_, PyAny>) -> PyResult<Change> {
     let key = fact(fact_text).map_err(PyValueError::new_err)?;
     Ok(match value.is_none() {
@@ -191,12 +191,12 @@ impl Client {
         Ok(Client { runtime, channels, resource_manager, world, session, is_closed })
     }
 
-    /// Raises `ratn.Error` where it is closed.
+    /// Raises `ratn.Error` if the client is closed.
     fn check_open(&self) -> PyResult<()> {
         self.open().map(drop)
     }
 
-    /// Waits until one of each of the kinds is free, and takes them under one lease.
+    /// Waits until one resource of each kind is free, and takes them under one lease.
     #[pyo3(signature = (kinds, *, priority=0, timeout_s=None, holder="python"))]
     fn acquire(
         &self,
@@ -221,7 +221,7 @@ impl Client {
         Ok(Lease { granted, held, generation, runtime: Arc::clone(&self.runtime) })
     }
 
-    /// The resources, each as a dict; of these kinds, where any is given.
+    /// The resources, each as a dict; only these kinds, if any is given.
     #[pyo3(signature = (*kinds))]
     fn resources<'py>(&self, py: Python<'py>, kinds: Vec<String>) -> PyResult<Vec<Bound<'py, PyDict>>> {
         let client = {
@@ -243,14 +243,14 @@ impl Client {
         shown.collect()
     }
 
-    /// The facts of the root world that match any of the patterns; all of them without one.
+    /// The facts of the root world that match any of the patterns; without patterns, all.
     #[pyo3(signature = (*patterns))]
     fn query(&self, py: Python<'_>, patterns: Vec<String>) -> PyResult<Vec<Fact>> {
         let patterns = patterns_of(&patterns)?;
         Ok(Fact::all(wait_for(py, self.open()?, self.world.root_at(None, &patterns))?.1))
     }
 
-    /// Writes a fact to the root world; the world's revision with it. `None` deletes it.
+    /// Writes a fact to the root world; returns the resulting revision. `None` deletes the fact.
     fn set(&self, py: Python<'_>, fact_text: &str, value: &Bound<'_, PyAny>) -> PyResult<u64> {
         let (commit, change) = (fresh_id("python"), change(fact_text, value)?);
         Ok(wait_for(py, self.open()?, self.world.commit(&commit, vec![change], None))?.0)
@@ -268,7 +268,7 @@ impl Client {
         let changes = changes.iter().map(|(text, value)| change(text, value)).collect::<PyResult<Vec<_>>>()?;
         let lease = self.acquire(py, vec![WORLD_MODEL.to_owned()], 0, timeout_s, "python")?;
         let made = || {
-            // A pattern that nothing matches: only the revision is asked for.
+            // A pattern that matches nothing, because only the revision is needed.
             let nothing = [FactPattern { predicate: "ratn_nothing".to_owned(), arguments: Vec::new() }];
             let base = wait_for(py, self.open()?, self.world.root_at(None, &nothing))?.0;
             let projection = Projection {
@@ -284,7 +284,7 @@ impl Client {
         match made() {
             Ok((base, id)) => Ok(Projected { base: base.0, id, lease, world: self.world.clone() }),
             Err(error) => {
-                // What went wrong first is what counts; the lease ends with the session otherwise.
+                // The first error is the one to report; otherwise the lease ends with the session.
                 lease.release(py).map(drop).or_else(|lost| beside(py, lost))?;
                 Err(error)
             }
@@ -300,7 +300,7 @@ impl Client {
         self.open()?.here()?.spawn(async move {
             loop {
                 let update = tokio::select! {
-                    // Nobody iterates over it any more, and it may be long until the next change.
+                    // Python does not iterate any more, and the next change may be far away.
                     () = tell.closed() => return,
                     update = watch.next() => update,
                 };
@@ -318,7 +318,7 @@ impl Client {
         let Ok(runtime) = self.runtime.here() else { return };
         self.is_closed.store(true, Ordering::Relaxed);
         let closed = async {
-            // Where a lease is still in use, its last user ends it.
+            // If a lease is still in use, its last user ends the session.
             if let Some(held) = self.session.lock().await.take().and_then(Arc::into_inner) {
                 held.session.close().await;
             }
@@ -332,7 +332,7 @@ impl Client {
 pub(crate) struct Lease {
     granted: ratn_model::resource::Lease,
     held: Arc<Held>,
-    /// Which of the sessions of this id, of which a manager that was started anew makes another one.
+    /// The generation of the session: a restarted manager makes a new session under the same id.
     generation: u64,
     runtime: Arc<OwnRuntime>,
 }

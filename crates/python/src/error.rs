@@ -1,4 +1,4 @@
-//! The exceptions of the package. Each has the words of whoever refused, which say what to do next.
+//! The exceptions of the package. Each carries the message of the part that refused, which says what to do next.
 
 use pyo3::create_exception;
 use pyo3::exceptions::{PyBaseException, PyException};
@@ -33,7 +33,7 @@ create_exception!(
 );
 create_exception!(_ratn, Lost, Error, "The world that the goal works on is gone; another attempt may have more luck.");
 
-/// Makes the exceptions known.
+/// Adds the exceptions to the module.
 pub(crate) fn add_to(py: Python<'_>, module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("Error", py.get_type::<Error>())?;
     module.add("Unavailable", py.get_type::<Unavailable>())?;
@@ -66,11 +66,11 @@ pub(crate) fn line(error: &(dyn StdError + 'static)) -> String {
     line
 }
 
-/// What a call without an answer is in Python: with the code and the reason of whoever refused as `code` and `reason`.
+/// The Python exception for a failed call; its attributes `code` and `reason` are those of the refusal.
 pub(crate) fn of_call(error: &CallError) -> PyErr {
     let raised = by_code(error);
     let code = error.code().map(|code| format!("{code:?}")).unwrap_or_default();
-    // `NotFound` → `NOT_FOUND`, as the protocol has it.
+    // `NotFound` → `NOT_FOUND`, as in the protocol.
     let mut said = String::new();
     for (index, character) in code.char_indices() {
         said.extend((index > 0 && character.is_uppercase()).then_some('_'));
@@ -78,7 +78,7 @@ pub(crate) fn of_call(error: &CallError) -> PyErr {
     }
     Python::attach(|py| {
         let value = raised.value(py);
-        // An exception takes any attribute.
+        // An exception accepts any attribute.
         let _ = value.setattr("code", said);
         let _ = value.setattr("reason", error.reason());
     });
@@ -87,7 +87,7 @@ pub(crate) fn of_call(error: &CallError) -> PyErr {
 
 fn by_code(error: &CallError) -> PyErr {
     let message = line(error);
-    // The names of gRPC's codes; the crate that has them is not among those that are used here.
+    // Compares the names of gRPC codes, because the crate that defines the codes is no dependency here.
     let code = error.code().map(|code| format!("{code:?}")).unwrap_or_default();
     match (error, code.as_str()) {
         (CallError::Broken { .. }, _) => Unavailable::new_err(message),
@@ -107,7 +107,7 @@ fn by_code(error: &CallError) -> PyErr {
     }
 }
 
-/// What an action that cannot read its world raises.
+/// The exception for an action that cannot read its world.
 pub(crate) fn of_world(failure: WorldFailure) -> PyErr {
     match ActionFailure::from(failure) {
         ActionFailure::Lost(reason) => Lost::new_err(reason),
@@ -115,7 +115,7 @@ pub(crate) fn of_world(failure: WorldFailure) -> PyErr {
     }
 }
 
-/// What a goal that did not come to an outcome raises.
+/// The exception for a goal that did not come to an outcome.
 pub(crate) fn of_failure(failure: ActionFailure) -> PyErr {
     match failure {
         ActionFailure::Aborted(reason) => Aborted::new_err(reason),
@@ -125,17 +125,17 @@ pub(crate) fn of_failure(failure: ActionFailure) -> PyErr {
     }
 }
 
-/// With the outcome that it comes to where it is let through.
+/// With the outcome that the goal gets if the exception is not caught.
 fn cancelled(outcome: &str, reason: String) -> PyErr {
     let raised = Cancelled::new_err(reason);
     Python::attach(|py| {
-        // An exception takes any attribute.
+        // An exception accepts any attribute.
         let _ = raised.value(py).setattr("outcome", outcome);
     });
     raised
 }
 
-/// What a `Cancelled` makes of a goal that nobody has told to stop, where it came of another one that was.
+/// The failure of a goal that was not told to stop itself, when it raises the `Cancelled` of another goal.
 pub(crate) fn stopped_elsewhere(raised: &Bound<'_, PyBaseException>, reason: String) -> Option<ActionFailure> {
     let outcome: String = raised.getattr("outcome").ok()?.extract().ok()?;
     match outcome.as_str() {

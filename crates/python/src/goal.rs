@@ -1,4 +1,4 @@
-//! A goal as an action in Python sees it. Whatever waits lets go of Python's lock, and ends when the goal shall stop.
+//! A goal in the form in which a Python action sees it. Every wait releases Python's lock, and ends when the goal is told to stop.
 
 use crate::error::{line, of_failure, of_world};
 use crate::numbers;
@@ -25,12 +25,12 @@ use tokio::task::AbortHandle;
 pub(crate) struct Goal {
     context: Arc<GoalContext>,
     runtime: Handle,
-    /// Of the worker: a fork of it hears nothing of the goal, and nobody hears what it tells.
+    /// The worker's process: in a fork, no news of the goal arrives, and no report is heard.
     process: Process,
     measured: Mutex<Vec<(FactKey, Value, Measurement)>>,
-    /// What waits for the goal being told to stop; nothing where it is over.
+    /// Tasks that wait for the goal to be told to stop; `None` when the goal is over.
     watching: Mutex<Option<Vec<AbortHandle>>>,
-    /// Set while Python's lock is held: what has waited for that asks again.
+    /// Set while Python's lock is held: a callback that has waited for the lock checks it again.
     over: Arc<AtomicBool>,
 }
 
@@ -46,19 +46,19 @@ impl Goal {
         }
     }
 
-    /// The goal, in the process that performs it.
+    /// The goal, if this is the process that performs it.
     fn here(&self) -> PyResult<&GoalContext> {
         self.process.check("this goal", "ask and tell in the action itself").map(|()| &*self.context)
     }
 
-    /// Nothing is called any more when it shall stop.
+    /// The goal is over: no callback of `on_cancel` is called any more.
     pub(crate) fn is_over(&self, _: Python<'_>) {
         self.over.store(true, Ordering::Relaxed);
         let watching = self.watching.lock().unwrap_or_else(PoisonError::into_inner).take();
         watching.iter().flatten().for_each(AbortHandle::abort);
     }
 
-    /// The outcome with what was measured.
+    /// The outcome with the measured facts.
     pub(crate) fn with_measured(&self, mut outcome: GoalOutcome) -> GoalOutcome {
         let measured = std::mem::take(&mut *self.measured.lock().unwrap_or_else(PoisonError::into_inner));
         for (key, value, measurement) in measured {

@@ -1,8 +1,8 @@
-//! The native part of the Python package `ratn`: what speaks to a system.
+//! The native part of the Python package `ratn`: the clients and the worker.
 //!
-//! It wraps `ratn-worker`, so that leases, fencing, sessions, drain and signals are the same code as in every other worker. It owns the
-//! conversion between Python's objects and the values of a system ([`value`]), and lets go of Python's lock wherever it waits. What is
-//! Python's business (annotations, decorators, `async def`, processes) is Python, beside it in `python/ratn`.
+//! It wraps `ratn-worker`, so that leases, fencing, sessions, drain and signals use the same code as in every other worker. It owns the
+//! conversion between Python objects and the values of a system ([`value`]), and releases Python's lock during every wait. Python code in
+//! `python/ratn` does the rest (annotations, decorators, `async def`, processes).
 
 mod client;
 mod error;

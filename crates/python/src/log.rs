@@ -1,4 +1,4 @@
-//! What an event log tells of a run, as `ratn-report` reads it: nodes, causes, the critical path, the chart. Nothing is computed here.
+//! An event log as evaluated by `ratn-report`: nodes, causes, the critical path, the chart. Nothing is computed here.
 
 use crate::error::{Error, line};
 use crate::task::json;
@@ -11,7 +11,7 @@ use ratn_report::timeline::{Activity, Ending, Instance, Job, Timeline};
 use serde_json::{Value, json as object};
 use std::path::PathBuf;
 
-/// An event log, read as far as it was written. What it gives is JSON, unless it says otherwise.
+/// An event log, read as far as it was written. Results are JSON, unless stated otherwise.
 #[pyclass(frozen, module = "ratn")]
 pub(crate) struct Log {
     run: Timeline,
@@ -25,7 +25,7 @@ impl Log {
         Ok(Log { run: Timeline::of(&log.lines) })
     }
 
-    /// A record of each attempt, in the order in which they began.
+    /// A record of each attempt, in the order in which the attempts began.
     fn nodes(&self) -> PyResult<String> {
         let mut jobs: Vec<(&Instance, &Job)> =
             self.run.instances().flat_map(|one| one.jobs.iter().map(move |job| (one, job))).collect();
@@ -33,7 +33,7 @@ impl Log {
         json(&jobs.into_iter().map(|(instance, job)| self.record(instance, job)).collect::<Vec<_>>())
     }
 
-    /// What each visit of a state waited for; of all visits whose path, path without numbers of visits, or last name it is.
+    /// What each visit of a state waited for; `name` is the path of a visit, a path without visit numbers, or the last part of one.
     fn why(&self, name: &str) -> PyResult<String> {
         let last = |path: &str| path.rsplit('/').next().unwrap_or(path).to_owned();
         let is_meant = |one: &&Instance| {
@@ -51,7 +51,7 @@ impl Log {
         paths
     }
 
-    /// What the run waited for, from its start to its end.
+    /// The critical path of the run.
     fn critical_path(&self) -> PyResult<String> {
         json(&ratn_report::critical::path(&self.run))
     }
@@ -61,12 +61,12 @@ impl Log {
         json(&Report::of(&self.run))
     }
 
-    /// The report, for people.
+    /// The report as a text for people.
     fn report_text(&self) -> String {
         Report::of(&self.run).to_string()
     }
 
-    /// The chart, as SVG; a row is a `resource` or a `node`.
+    /// The Gantt chart as SVG; a row is a `resource` or a `node`.
     fn gantt(&self, by: &str) -> PyResult<String> {
         let by = match by {
             "resource" => By::Resource,

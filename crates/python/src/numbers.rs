@@ -1,8 +1,8 @@
-//! Numbers and bytes in one piece of memory, at which numpy looks without a copy; and arrays of numpy, which are read as one piece of memory.
+//! Numbers and bytes in contiguous memory, which numpy views without a copy; and the reading of numpy arrays.
 //!
-//! What comes from a system keeps its memory as long as anybody looks at it, and nothing writes to it: the arrays are read-only. What an
-//! action gives is copied, once: it may change its array afterwards. numpy is neither needed nor imported here; it is known by the
-//! protocol of its arrays (`__array_interface__`, version 3).
+//! Values that come from a system keep their memory as long as an array uses it, and are never written to: the arrays are read-only. Values
+//! that an action returns are copied once: the action may change its array afterwards. numpy is neither needed nor imported here; its
+//! arrays are recognised by their protocol (`__array_interface__`, version 3).
 
 use pyo3::exceptions::{PyIndexError, PyValueError};
 use pyo3::prelude::*;
@@ -15,12 +15,12 @@ use std::sync::Arc;
 
 const ORDER: char = if cfg!(target_endian = "little") { '<' } else { '>' };
 
-/// Floats in a memory that is shared and never changes.
+/// Floats in shared, immutable memory.
 #[derive(Clone, Debug)]
 pub(crate) enum Floats {
-    /// Their own.
+    /// In memory of their own.
     Own(Arc<Vec<f64>>),
-    /// That of a fact, and where in it they are.
+    /// Within a fact, with the function that finds them there.
     Of(Arc<FactRecord>, fn(&FactRecord) -> &[f64]),
 }
 
@@ -42,7 +42,8 @@ impl Deref for Floats {
 }
 
 impl Floats {
-    /// What numpy makes an array of without a copy: the array keeps the object that says this alive, and nothing moves the memory.
+    /// The array interface, of which numpy makes an array without a copy: the array keeps the Python object alive, and the memory does not
+    /// move.
     pub(crate) fn interface<'py>(&self, py: Python<'py>, shape: &[usize]) -> PyResult<Bound<'py, PyDict>> {
         interface(py, "f8", self.as_ptr() as usize, shape)
     }
@@ -53,7 +54,7 @@ fn interface<'py>(py: Python<'py>, kind: &str, address: usize, shape: &[usize]) 
     told.set_item("version", 3)?;
     told.set_item("shape", PyTuple::new(py, shape)?)?;
     told.set_item("typestr", format!("{}{kind}", if kind == "u1" { '|' } else { ORDER }))?;
-    // Nobody may write there.
+    // Read-only.
     told.set_item("data", (address, true))?;
     Ok(told)
 }
@@ -75,25 +76,25 @@ pub(crate) struct Numbers {
 }
 
 impl Numbers {
-    /// As many as there are, one after the other.
+    /// A vector of all floats.
     pub(crate) fn row(floats: Floats) -> Numbers {
         let shape = vec![floats.len()];
         Numbers { memory: Memory::Floats(floats), shape }
     }
 
-    /// A matrix of so many columns, row by row.
+    /// A matrix with this number of columns, row by row.
     pub(crate) fn matrix(floats: Floats, columns: usize) -> Numbers {
         let shape = vec![floats.len().checked_div(columns).unwrap_or_default(), columns];
         Numbers { memory: Memory::Floats(floats), shape }
     }
 
-    /// A square matrix; what is none is a row.
+    /// A square matrix; a vector if the number of floats is not a square.
     pub(crate) fn square(floats: Floats) -> Numbers {
         let side = floats.len().isqrt();
         if side * side == floats.len() { Numbers::matrix(floats, side) } else { Numbers::row(floats) }
     }
 
-    /// A value as an array looks at it: bytes, a list of numbers, or lists of as many numbers each. What is otherwise comes back.
+    /// A value for an array: bytes, a list of numbers, or lists of equal length. Any other value is returned as the error.
     pub(crate) fn of(value: Value) -> Result<Numbers, Value> {
         match value {
             Value::Bytes(bytes) => Ok(Numbers { shape: vec![bytes.len()], memory: Memory::Bytes(Arc::new(bytes)) }),
@@ -105,7 +106,7 @@ impl Numbers {
         }
     }
 
-    /// As a value of the system.
+    /// Converts back to a value of the system.
     pub(crate) fn value(&self) -> Value {
         let floats = match &self.memory {
             Memory::Bytes(bytes) => return Value::Bytes(bytes.to_vec()),
@@ -122,7 +123,7 @@ impl Numbers {
         }
     }
 
-    /// Those from one place on, as Python has them.
+    /// Elements from an index on, as a Python list.
     fn listed<'py>(&self, py: Python<'py>, from: usize, length: usize) -> PyResult<Bound<'py, PyList>> {
         match &self.memory {
             Memory::Bytes(bytes) => PyList::new(py, &bytes[from..from + length]),
@@ -181,13 +182,13 @@ impl Numbers {
     }
 }
 
-/// Which of so many is meant, from the end where it is negative.
+/// The index of an element; a negative index counts from the end.
 pub(crate) fn place(index: isize, length: usize) -> Option<usize> {
     let place = if index < 0 { length.checked_sub(index.unsigned_abs())? } else { usize::try_from(index).ok()? };
     (place < length).then_some(place)
 }
 
-/// What Python gives as numbers one after the other: an array, or whatever has numbers in it, and lists of them row by row.
+/// Reads numbers from a Python object: an array, or anything iterable with numbers, also lists row by row.
 pub(crate) fn taken(object: &Bound<'_, PyAny>) -> PyResult<Vec<f64>> {
     if let Ok(numbers) = object.cast::<Numbers>() {
         return Ok(numbers.get().floats());
@@ -203,7 +204,7 @@ pub(crate) fn taken(object: &Bound<'_, PyAny>) -> PyResult<Vec<f64>> {
     Ok(rows.collect::<PyResult<Vec<_>>>()?.concat())
 }
 
-/// The floats of an array of numpy, and its shape. Nothing where it is another object, or an array of something else.
+/// The floats of a numpy array, and its shape. `None` for another object, or an array of another type.
 pub(crate) fn array(object: &Bound<'_, PyAny>) -> PyResult<Option<(Vec<f64>, Vec<usize>)>> {
     let Ok(told) = object.getattr("__array_interface__") else { return Ok(None) };
     let (Ok(kind), Ok(shape)) = (told.get_item("typestr"), told.get_item("shape")) else { return Ok(None) };
@@ -216,7 +217,7 @@ pub(crate) fn array(object: &Bound<'_, PyAny>) -> PyResult<Option<(Vec<f64>, Vec
     if shape.is_empty() {
         return Ok(None);
     }
-    // Row by row, however they lie there.
+    // Row by row, whatever the memory layout.
     let bytes = object.call_method0("tobytes")?;
     let floats = read(bytes.cast::<PyBytes>()?.as_bytes());
     if floats.len() != shape.iter().product::<usize>() {
@@ -225,7 +226,7 @@ pub(crate) fn array(object: &Bound<'_, PyAny>) -> PyResult<Option<(Vec<f64>, Vec
     Ok(Some((floats, shape)))
 }
 
-/// Floats row by row as lists within lists.
+/// Floats as nested lists, row by row.
 pub(crate) fn nested(floats: &[f64], shape: &[usize]) -> Value {
     match shape {
         [] | [_] => Value::List(floats.iter().copied().map(Value::Float).collect()),
@@ -236,7 +237,7 @@ pub(crate) fn nested(floats: &[f64], shape: &[usize]) -> Value {
     }
 }
 
-/// Numbers one after the other with their shape, where they are that, or rows of as many each.
+/// Numbers with their shape, from a list of numbers or of rows with equal length.
 fn floats_of(items: &List) -> Option<(Vec<f64>, Vec<usize>)> {
     let row = |items: &List| items.iter().map(Value::as_number).collect::<Option<Vec<f64>>>();
     let Some(Value::List(first)) = items.first() else { return Some((row(items)?, vec![items.len()])) };
@@ -255,7 +256,7 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
 
-    /// Where an object says that its numbers lie.
+    /// The address of an object's numbers, from its array interface.
     fn address(object: &Bound<'_, PyAny>) -> usize {
         let told = object.getattr("__array_interface__").unwrap();
         told.get_item("data").unwrap().get_item(0).unwrap().extract().unwrap()

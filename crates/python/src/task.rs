@@ -1,7 +1,7 @@
-//! What Python needs of the language of task files: the tree of a file, its findings, the model that it is, and the catalogue.
+//! What Python needs of the language of task files: the tree of a file, its findings, its model, and the catalogue.
 //!
-//! Tracing a Python function, and writing YAML, are Python's (`python/ratn/_task.py`); what a task means is decided by `ratn-model` alone.
-//! What has many fields goes to Python as JSON.
+//! Tracing a Python function, and writing YAML, is done in Python (`python/ratn/_task.py`); only `ratn-model` decides what a task means.
+//! Results with many fields are passed to Python as JSON.
 
 use crate::error::{Error, InvalidTask, line};
 use pyo3::prelude::*;
@@ -12,7 +12,7 @@ use ratn_model::expression::Function;
 use ratn_model::load::{Document, Files, MAX_SOURCE, load_with};
 use std::path::Path;
 
-/// The tree of a task file, of dicts, lists, texts, numbers and booleans. What is no YAML raises `ratn.InvalidTask`.
+/// The tree of a task file: dicts, lists, texts, numbers and booleans. Invalid YAML raises `ratn.InvalidTask`.
 #[pyfunction]
 pub(crate) fn read_yaml<'py>(py: Python<'py>, text: &str, file: &str) -> PyResult<Bound<'py, PyAny>> {
     let document = Document::read(text, file);
@@ -40,8 +40,8 @@ fn to_python<'py>(py: Python<'py>, document: &Document) -> PyResult<Bound<'py, P
     })
 }
 
-/// The findings of a task file, and the model that it is unless it is refused; both as JSON. Catalogues, as TOML, extend the built-in one;
-/// libraries and ontologies are read from the folder of `file`.
+/// The findings for a task file, and its model unless it is refused; both as JSON. Catalogues, as TOML, extend the built-in one; libraries
+/// and ontologies are read from the folder of `file`.
 #[pyfunction]
 pub(crate) fn check_task(
     py: Python<'_>,
@@ -60,7 +60,7 @@ pub(crate) fn check_task(
     Ok((json(&findings)?, program))
 }
 
-/// The built-in catalogue, extended by others in TOML; as JSON.
+/// The built-in catalogue, extended by others in TOML, as JSON.
 #[pyfunction]
 pub(crate) fn catalogue(catalogues: Vec<String>) -> PyResult<String> {
     json(&composed(&catalogues)?)
@@ -90,14 +90,14 @@ pub(crate) fn json(value: &impl serde::Serialize) -> PyResult<String> {
     serde_json::to_string(value).map_err(|error| Error::new_err(line(&error)))
 }
 
-/// Libraries and ontologies stand beside the files that use them.
+/// Reads libraries and ontologies relative to the files that use them.
 struct Beside;
 
 impl Files for Beside {
     fn read(&self, using: &str, path: &str) -> Result<(String, String), String> {
         let file = Path::new(using).parent().unwrap_or(Path::new("")).join(path);
         let text = read(&file).map_err(|error| error.to_string())?;
-        // Two ways to one file are one file.
+        // Different paths to the same file have to be equal.
         Ok((file.canonicalize().unwrap_or(file).display().to_string(), text))
     }
 }

@@ -1,5 +1,5 @@
-//! The threads in which goals run Python. What the interpreter keeps for a thread is made once for each of them and not for every
-//! goal, so also `threading.local` lasts from one goal to the next.
+//! The threads in which goals run Python. The interpreter's state for a thread is made once per thread and not per goal, so that
+//! `threading.local` also lasts from one goal to the next.
 
 use pyo3::prelude::*;
 use std::sync::mpsc::{Sender, channel};
@@ -9,7 +9,7 @@ use tokio::sync::oneshot;
 
 type Work = Box<dyn FnOnce(Python<'_>, Finished) + Send>;
 
-/// As many threads as goals ever ran at once. Clones share them.
+/// A thread pool: it has as many threads as goals ever ran at once. Clones share it.
 #[derive(Clone, Default)]
 pub(crate) struct Threads(Arc<Shared>);
 
@@ -21,14 +21,14 @@ struct Shared {
 
 #[derive(Default)]
 struct State {
-    /// Of those that wait for work, the last one first.
+    /// Channels of the idle threads; the last one is used first.
     idle: Vec<Sender<Work>>,
-    /// How many there are.
+    /// Number of threads.
     alive: usize,
     is_over: bool,
 }
 
-/// A thread whose work is done waits for more.
+/// A thread that has finished its work and waits for more.
 struct Finished {
     shared: Arc<Shared>,
     thread: Sender<Work>,
@@ -50,8 +50,8 @@ impl Shared {
 }
 
 impl Threads {
-    /// Runs it in a thread that nothing else runs in meanwhile. Nothing comes back where it panicked, and an error where there can be no
-    /// further thread.
+    /// Runs `work` in a thread that runs nothing else meanwhile. The receiver gets nothing if `work` panicked. An error if no further
+    /// thread can be started.
     pub(crate) fn run<T: Send + 'static>(
         &self,
         work: impl FnOnce(Python<'_>) -> T + Send + 'static,
@@ -59,13 +59,13 @@ impl Threads {
         let (say, done) = oneshot::channel();
         let work: Work = Box::new(move |py, finished| {
             let result = work(py);
-            // Before anybody hears of it, who may have the next at once.
+            // Before the result is sent, because its receiver may have the next work at once.
             finished.rest();
             let _ = say.send(result);
         });
         let idle = self.0.state().idle.pop();
         match idle {
-            // It ends only when nothing can be sent to it any more.
+            // The thread ends only when its channel is closed.
             Some(thread) => drop(thread.send(work)),
             None => self.begin(work)?,
         }
@@ -82,7 +82,7 @@ impl Threads {
                 while let Some(work) = next {
                     let (thread, more) = channel();
                     work(py, Finished { shared: Arc::clone(&shared), thread });
-                    // It hears of the end when all that could send are gone.
+                    // `None` when all senders are gone.
                     next = py.detach(move || more.recv().ok());
                 }
             });
@@ -90,7 +90,7 @@ impl Threads {
         Ok(())
     }
 
-    /// Ends all that wait for work, and waits so long for those that do not.
+    /// Ends all idle threads, and waits for the others at most for `patience`.
     pub(crate) fn end(&self, patience: Duration) {
         let mut state = self.0.state();
         state.is_over = true;
@@ -100,7 +100,7 @@ impl Threads {
     }
 }
 
-/// One of the threads that there are.
+/// Counts one existing thread.
 struct Alive(Arc<Shared>);
 
 impl Alive {
@@ -122,7 +122,7 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
 
-    /// In which thread it runs.
+    /// The thread in which work runs.
     async fn thread(threads: &Threads) -> std::thread::ThreadId {
         threads.run(|_| std::thread::current().id()).unwrap().await.unwrap()
     }

@@ -1,4 +1,4 @@
-//! The values of a system as Python's objects, and back.
+//! Converts the values of a system to Python objects, and back.
 //!
 //! | value | Python |
 //! |---|---|
@@ -6,7 +6,7 @@
 //! | list, map | `list`, `dict` with names as keys |
 //! | pose, joints, trajectory | [`Pose`], [`Joints`], [`Trajectory`] |
 //!
-//! An array of numpy is taken as its memory lies there ([`crate::numbers`]); what else has a method `tolist` as what that gives.
+//! A numpy array is read from its memory ([`crate::numbers`]); for any other object with a method `tolist`, the result of that is used.
 
 use crate::numbers::{self, Floats, Numbers};
 use pyo3::exceptions::{PyTypeError, PyValueError};
@@ -21,9 +21,9 @@ use ratn_proto::types::FactRecord;
 use std::collections::{BTreeMap, HashSet};
 use std::sync::{Arc, OnceLock};
 
-/// Lists within lists, and the like: no deeper.
+/// Maximum nesting depth of lists and maps.
 const MAX_DEPTH: usize = 32;
-/// A quaternion whose length differs from 1 by less than this has that length.
+/// A quaternion whose length differs from 1 by less than this counts as normalised.
 const UNIT: f64 = 1e-12;
 
 /// A rigid pose: a position in metres, and an orientation as a unit quaternion (x, y, z, w).
@@ -45,7 +45,7 @@ impl Pose {
         if !(length.is_finite() && length > 1e-9) {
             return Err(PyValueError::new_err("quaternion: has no length; expected (x, y, z, w)"));
         }
-        // One of length 1, but for rounding, stays as it is: a pose that was pickled or printed is the same again.
+        // A normalised quaternion stays as it is, so that a pose that was pickled or printed is read back unchanged.
         let length = if (length - 1.0).abs() < UNIT { 1.0 } else { length };
         let quaternion_xyzw = quaternion.map(|part| part / length);
         Ok(Pose(pose::Pose { position: [x, y, z], quaternion_xyzw }))
@@ -183,15 +183,15 @@ pub(crate) struct Trajectory {
     columns: OnceLock<Columns>,
 }
 
-/// A point as Python has it: seconds, positions, velocities.
+/// A point in Python: seconds, positions, velocities.
 type Point = (f64, Vec<f64>, Vec<f64>);
 
-/// What the points of a trajectory have in common, put side by side when it is looked at for the first time.
+/// The columns of a trajectory, made when they are first asked for.
 #[derive(Debug)]
 struct Columns {
     times_s: Floats,
     positions: Floats,
-    /// Nothing where a point has none.
+    /// `None` if any point has no velocities.
     velocities: Option<Floats>,
 }
 
@@ -219,7 +219,7 @@ impl Trajectory {
         })
     }
 
-    /// Points of as many joints, from rows that lie one after the other; without velocities where there are none.
+    /// Points made from contiguous rows, one per point; without velocities if there are none.
     fn of_columns(
         joints: Vec<String>,
         times_s: &[f64],
@@ -346,7 +346,7 @@ impl Trajectory {
 #[pyclass(frozen, module = "ratn")]
 pub(crate) struct Fact {
     record: Arc<FactRecord>,
-    /// Made when it is asked for: most facts of an answer are looked at by their keys only.
+    /// Converted on demand: of most facts only the key is used.
     value: PyOnceLock<Py<PyAny>>,
 }
 
@@ -421,12 +421,12 @@ impl Fact {
     }
 }
 
-/// The joints' positions that are the value of a fact; none where it is another one.
+/// The joint positions in a fact's value; empty for another type of value.
 fn positions(record: &FactRecord) -> &[f64] {
     if let Value::Joints(positions) = &record.value { positions } else { &[] }
 }
 
-/// The covariance of a fact, row by row; nothing where it has none.
+/// The covariance of a fact, row by row; empty without one.
 fn covariance(record: &FactRecord) -> &[f64] {
     match record.measured.as_ref().and_then(|measured| measured.certainty.as_ref()) {
         Some(Certainty::Covariance(entries)) => entries,
@@ -434,7 +434,7 @@ fn covariance(record: &FactRecord) -> &[f64] {
     }
 }
 
-/// A value as Python has it. What has numbers in it keeps its memory.
+/// Converts a value to Python. Values with numbers keep their memory.
 pub(crate) fn to_python(py: Python<'_>, value: Value) -> PyResult<Bound<'_, PyAny>> {
     Ok(match value {
         Value::Null => py.None().into_bound(py),
@@ -454,7 +454,7 @@ pub(crate) fn to_python(py: Python<'_>, value: Value) -> PyResult<Bound<'_, PyAn
     })
 }
 
-/// Ports, or the fields of a map, as Python has them.
+/// Converts ports, or the fields of a map, to Python.
 pub(crate) fn fields_to_python(py: Python<'_>, fields: BTreeMap<String, Value>) -> PyResult<Bound<'_, PyDict>> {
     let taken = PyDict::new(py);
     for (name, value) in fields {
@@ -463,7 +463,7 @@ pub(crate) fn fields_to_python(py: Python<'_>, fields: BTreeMap<String, Value>) 
     Ok(taken)
 }
 
-/// The inputs of a goal as Python has them. `arrays` are those that shall be arrays: of them what numpy looks at without a copy.
+/// Converts the inputs of a goal to Python. Those named in `arrays` become objects that numpy views without a copy.
 pub(crate) fn inputs_to_python<'py>(
     py: Python<'py>,
     inputs: BTreeMap<String, Value>,
@@ -480,17 +480,17 @@ pub(crate) fn inputs_to_python<'py>(
     Ok(taken)
 }
 
-/// As Python hashes numbers, of which 0 and -0 are the same.
+/// Python's hash of numbers, for which 0 and -0 are equal.
 fn hash(py: Python<'_>, numbers: &[f64]) -> PyResult<isize> {
     PyTuple::new(py, numbers)?.hash()
 }
 
-/// What Python gives as a value.
+/// Converts a Python object to a value.
 pub(crate) fn from_python(object: &Bound<'_, PyAny>) -> PyResult<Value> {
     taken(object, 0)
 }
 
-/// What Python gives as ports.
+/// Converts a Python dict to ports.
 pub(crate) fn fields_from_python(fields: &Bound<'_, PyDict>) -> PyResult<BTreeMap<String, Value>> {
     named(fields, 0)
 }

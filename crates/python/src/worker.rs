@@ -1,5 +1,5 @@
-//! A worker whose actions are Python functions. Each goal is performed in a thread that it has for itself, which has Python's lock only while Python
-//! runs; the daemon's questions are answered meanwhile.
+//! A worker whose actions are Python functions. Each goal is performed in a thread of its own, which holds Python's lock only while Python
+//! runs; calls of the daemons are answered meanwhile.
 
 use crate::error::{Aborted, Cancelled, Error, Lost, line};
 use crate::goal::Goal;
@@ -25,17 +25,17 @@ use tokio::runtime::{Builder, Handle};
 use tokio::sync::watch;
 use tracing_subscriber::EnvFilter;
 
-/// Threads of goals that have not ended are left alone after this long.
+/// Time limit for the threads of goals at the end; threads that run longer are abandoned.
 const LAST_THREADS: Duration = Duration::from_secs(1);
-/// No more of a traceback, or of what else an action says, goes into a run's reason.
+/// Maximum size of a traceback, or of another text of an action, in the reason of a goal.
 const MAX_TRACEBACK_BYTES: usize = 8 * 1024;
 
-/// An action as Python describes it.
+/// An action as described by Python.
 #[derive(FromPyObject)]
 pub(crate) struct Described {
     name: String,
     description: String,
-    /// Name, type, whether every goal has it, and else what it is without.
+    /// Name, type, whether it is required, and otherwise its default.
     inputs: Vec<(String, String, bool, Py<PyAny>)>,
     outputs: Vec<(String, String)>,
     outcomes: Vec<String>,
@@ -44,32 +44,32 @@ pub(crate) struct Described {
     senses: Vec<String>,
     requires: Vec<String>,
     effects: Option<Vec<String>>,
-    /// Kinds of resources beside its own.
+    /// Kinds of resources that it blocks in addition to its own.
     blocks: Vec<String>,
-    /// How long it usually takes, as an expression.
+    /// Its usual duration, as an expression.
     takes: Option<String>,
-    /// It stands still while its goal is suspended.
+    /// Whether it stands still while its goal is suspended.
     suspends: bool,
-    /// It gives a result that can be used, and better ones later.
+    /// Whether it is an anytime action: it gives a result that can be used, and better ones later.
     anytime: bool,
-    /// The inputs that are arrays.
+    /// Inputs that are passed as arrays.
     arrays: HashSet<String>,
-    /// Called with the goal and its inputs as a dict; gives an outcome, its outputs as a dict and a reason.
+    /// Called with the goal and its inputs as a dict; returns an outcome, its outputs as a dict and a reason.
     perform: Py<PyAny>,
 }
 
-/// What a driver says beside its actions.
+/// The settings of a driver in addition to its actions.
 #[derive(FromPyObject)]
 pub(crate) struct Driven {
-    /// Called with `ready`, `held` or `stopped`, and why.
+    /// Called with `ready`, `held` or `stopped`, and the reason.
     brakes: Py<PyAny>,
-    /// Where a stop is kept.
+    /// The file that keeps an emergency stop.
     stop_file: Option<PathBuf>,
-    /// Within which everything stands still after a lease has ended.
+    /// The time within which everything stands still after a lease has ended.
     standstill_s: Option<f64>,
 }
 
-/// Serves until a signal or the parent's end says otherwise. `arguments` are those of the process, as a template passes them.
+/// Serves until a signal or the end of the parent. `arguments` are those of the process, as passed by a template.
 #[pyfunction]
 #[pyo3(signature = (arguments, provider, kind, actions, without_leases, driven=None))]
 pub(crate) fn serve(
@@ -93,7 +93,7 @@ pub(crate) fn serve(
         worker = worker.without_leases();
     }
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
-    // Where a program has one already, that one is told.
+    // If the program has a subscriber already, that one gets the log.
     let _ = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(false).try_init();
     let standstill = driven.as_ref().and_then(|driven| driven.standstill_s);
     if let Some(seconds) = standstill {
@@ -101,7 +101,7 @@ pub(crate) fn serve(
         worker = worker.standstill(bound.ok_or_else(|| PyValueError::new_err("standstill_s: has an end"))?);
     }
     let ended = py.detach(|| {
-        // More than one would wake each other for every goal, and have nothing to do.
+        // One thread is enough: more would wake each other for every goal, without work to do.
         let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build();
         let runtime = runtime.map_err(|source| WorkerError::System { what: "start its runtime".to_owned(), source })?;
         let ended = runtime.block_on(async {
@@ -127,15 +127,16 @@ impl Driven {
     }
 }
 
-/// Brakes that are a Python function. A stop does not wait for an earlier call: it is made in another thread then. A call of Python cannot be
-/// dropped, so the earlier one may still do what it was told, `ready` for one, after the newer one has returned; or keep the newer one from what they
-/// both need. Hence the newer one is made once more when all earlier ones have returned, whatever it gave, and only that one is the answer.
+/// Brakes that are a Python function. A stop does not wait for an earlier call: it is made in another thread then. A Python call cannot be
+/// dropped, so the earlier one may still carry out its state, for example `ready`, after the newer one has returned; or it may hold what
+/// the newer one needs. So the newer call is repeated when all earlier ones have returned, whatever its result was, and only the repeated
+/// call's result counts.
 struct PythonBrakes {
     apply: Arc<Py<PyAny>>,
     calls: watch::Sender<BrakeCalls>,
 }
 
-/// The calls of the brakes, by number, and the newest state that they were asked for, likewise.
+/// The calls of the brakes under way, by number, and the number of the newest requested state.
 #[derive(Debug, Default)]
 struct BrakeCalls {
     newest: u64,
@@ -148,7 +149,7 @@ struct BrakeCall {
     calls: watch::Sender<BrakeCalls>,
     state: u64,
     number: u64,
-    /// Earlier ones were under way when it began.
+    /// Whether earlier calls were under way when it began.
     overlaps: bool,
 }
 
@@ -164,7 +165,7 @@ impl BrakeCall {
         BrakeCall { calls: calls.clone(), state, number, overlaps }
     }
 
-    /// Whether a newer state was asked for.
+    /// Whether a newer state was requested.
     fn is_superseded(&self) -> bool {
         self.calls.borrow().newest > self.state
     }
@@ -183,7 +184,7 @@ impl PythonBrakes {
         PythonBrakes { apply: Arc::new(apply), calls: watch::Sender::default() }
     }
 
-    /// Calls the function: what it gave, and whether an earlier call may have undone that, or kept it from it.
+    /// Calls the function; returns its result, and whether an earlier call may have undone it, or prevented it.
     async fn call(&self, state: u64, word: &'static str, reason: String) -> (Result<(), String>, bool) {
         let (apply, call) = (Arc::clone(&self.apply), BrakeCall::begin(&self.calls, state));
         let overlaps = call.overlaps;
@@ -236,10 +237,10 @@ struct PythonAction {
     threads: Threads,
 }
 
-/// What performs the goals.
+/// The Python function that performs the goals.
 struct Function {
     perform: Py<PyAny>,
-    /// The inputs that it wants as arrays.
+    /// Inputs that it takes as arrays.
     arrays: HashSet<String>,
 }
 
@@ -314,7 +315,7 @@ impl Action for PythonAction {
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let mut goal = goal;
-        // Python has their memory from here on.
+        // From here on, Python owns their memory.
         let inputs = std::mem::take(&mut goal.inputs);
         let (goal, function, runtime) = (Arc::new(goal), Arc::clone(&self.function), Handle::current());
         let performed = self.threads.run(move |py| perform(py, &goal, inputs, &function, runtime));
@@ -342,14 +343,14 @@ fn perform(
     given().map_err(|error| failure(py, context, &error))
 }
 
-/// What an exception makes of the goal. One that is nobody's plan is in the worker's log and in the goal's reason, with its traceback.
+/// The failure of a goal by its exception. An unexpected exception is logged by the worker, and is the goal's reason, with its traceback.
 fn failure(py: Python<'_>, context: &GoalContext, error: &PyErr) -> ActionFailure {
     let message = || error.value(py).to_string();
     if error.is_instance_of::<Cancelled>(py) {
         if context.cancelled.is_cancelled() {
             return context.stopped();
         }
-        // Another provider's goal that it waited for was told to stop.
+        // The goal waited for a goal of another provider that was told to stop.
         if let Some(failure) = crate::error::stopped_elsewhere(error.value(py), message()) {
             return failure;
         }
@@ -366,7 +367,7 @@ fn failure(py: Python<'_>, context: &GoalContext, error: &PyErr) -> ActionFailur
     ActionFailure::Aborted(shortened(format!("{error}\n{traceback}")))
 }
 
-/// Without its middle, where it is too long.
+/// Omits the middle of a text that is too long.
 fn shortened(text: String) -> String {
     if text.len() <= MAX_TRACEBACK_BYTES {
         return text.trim_end().to_owned();

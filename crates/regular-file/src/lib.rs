@@ -1,8 +1,9 @@
-//! Reading and writing a file that somebody names: on the command line, in a log, in the file of a robot.
+//! Opens files whose path comes from outside: from the command line, from a log, from a robot description.
 //!
-//! Only a regular file is opened. A named pipe would make its reader wait for a writer, a device may never end, and opening one may already do
-//! something. What has the name may be another file a moment later, so it is looked at before it is opened and once it is open, and it is opened
-//! without waiting. What is written may also go to a device or a pipe, but to none that nobody reads: opening it would wait for a reader.
+//! For reading, only regular files are opened. A named pipe would make its reader wait for a writer, a device may never end, and opening
+//! one may already have an effect. Another file may get the name at any time, so the file is checked before and after it is opened, and
+//! opened without blocking. Writing may also go to a device or a pipe, but not to a pipe that nobody reads: opening it would wait for a
+//! reader.
 
 use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, OFlag, fcntl};
@@ -11,13 +12,13 @@ use std::io::{Error, ErrorKind, Read, Result};
 use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
 use std::path::Path;
 
-/// More bytes than a config, a certificate, an ontology or the description of a robot has.
+/// Maximum size for small files, in bytes: larger than any config, certificate, ontology or robot description.
 pub const USUAL: usize = 16 << 20;
 
-/// Opens a regular file to read it. It never waits for anybody.
+/// Opens a regular file for reading. Never blocks.
 ///
 /// # Errors
-/// What the system says; where something else has the name, [`ErrorKind::InvalidInput`].
+/// The system's error; if the path is not a regular file, [`ErrorKind::InvalidInput`].
 pub fn open(path: &Path) -> Result<File> {
     regular(std::fs::metadata(path)?.is_file())?;
     let flags = OFlag::O_NONBLOCK | OFlag::O_NOCTTY;
@@ -26,10 +27,10 @@ pub fn open(path: &Path) -> Result<File> {
     Ok(file)
 }
 
-/// What is in a regular file of at most `most` bytes.
+/// The content of a regular file of at most `most` bytes.
 ///
 /// # Errors
-/// As [`open`]; where it is longer, [`ErrorKind::FileTooLarge`].
+/// As [`open`]; if the file is longer, [`ErrorKind::FileTooLarge`].
 pub fn read(path: &Path, most: usize) -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?.take(most as u64 + 1).read_to_end(&mut bytes)?;
@@ -42,15 +43,15 @@ pub fn read(path: &Path, most: usize) -> Result<Vec<u8>> {
 /// The text of a regular file of at most `most` bytes.
 ///
 /// # Errors
-/// As [`read`]; where it is no UTF-8, [`ErrorKind::InvalidData`].
+/// As [`read`]; if the text is not UTF-8, [`ErrorKind::InvalidData`].
 pub fn read_text(path: &Path, most: usize) -> Result<String> {
     String::from_utf8(read(path, most)?).map_err(|error| Error::new(ErrorKind::InvalidData, error))
 }
 
-/// Opens what these options say to write it. It never waits for anybody; writing into a pipe waits for its reader, as ever.
+/// Opens a file for writing with these options. Opening never blocks; writing to a pipe waits for its reader, as usual.
 ///
 /// # Errors
-/// What the system says; where the file is a pipe that nobody reads, [`ErrorKind::NotConnected`].
+/// The system's error; if the file is a pipe that nobody reads, [`ErrorKind::NotConnected`].
 pub fn open_to_write(path: &Path, options: &mut OpenOptions) -> Result<File> {
     let flags = OFlag::O_NONBLOCK | OFlag::O_NOCTTY;
     let file = options.custom_flags(flags.bits()).open(path).map_err(|error| {
@@ -101,7 +102,7 @@ mod tests {
         assert!(refused.kind() == ErrorKind::NotConnected && refused.to_string().contains("nobody reads"), "{refused}");
         let mut reader = File::options().read(true).custom_flags(OFlag::O_NONBLOCK.bits()).open(&pipe).unwrap();
         let mut writer = to_write().unwrap();
-        // More than a pipe holds: it waits, and is no error.
+        // More than a pipe holds: the writer waits, without an error.
         let writing = std::thread::spawn(move || writer.write_all(&[7; 200_000]));
         let mut read = 0;
         while read < 200_000 {

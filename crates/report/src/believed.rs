@@ -1,5 +1,4 @@
-//! The world as a run believes it, from its log, and the scene that follows from it: the shapes of objects in their places, and where the
-//! base stands.
+//! The world as believed by a run, from its log, and the scene that follows from it: shapes and poses of objects, and the pose of the base.
 
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
 use ratn_world::scene::Scene;
@@ -12,7 +11,7 @@ pub struct Believed {
 }
 
 impl Believed {
-    /// Whether a line says something of the root world.
+    /// Applies a line; returns whether it changed the root world.
     pub fn follow(&mut self, line: &LogLine) -> bool {
         match &line.entry {
             LogEntry::Event(Event::Started { world, .. }) => {
@@ -23,13 +22,13 @@ impl Believed {
                 self.world.overwrite(facts.iter().cloned());
                 true
             }
-            // The run has made the same changes. What does not fit here is left out, and what is known is shown.
+            // The run has made the same changes. A change that does not fit is ignored, and the world stays as known.
             LogEntry::Command(Command::Commit { changes, .. }) => self.world.apply(changes).is_ok(),
             _ => false,
         }
     }
 
-    /// The scene; none where a fact has a form from which none can be made.
+    /// The scene; `None` if a fact has a form that yields no scene.
     pub fn scene(&self) -> Option<Scene> {
         Scene::of(&self.world).ok()
     }

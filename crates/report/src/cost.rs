@@ -1,5 +1,5 @@
-//! What a report costs does not grow faster than the log: of sixteen times as many nodes it takes about sixteen times as long. Measured is the
-//! processor time of this thread, of which other processes of the machine take nothing.
+//! Tests that the cost of a report grows no faster than the log: sixteen times as many nodes take about sixteen times as long. Measured in
+//! processor time of this thread, which other processes on the machine do not affect.
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
@@ -11,12 +11,12 @@ use rustix::time::{ClockId, clock_gettime};
 
 const FEW: u64 = 400;
 const TIMES: u64 = 16;
-/// A square would be 16 times as much for each node.
+/// Maximum growth of the time per node. Quadratic cost would give 16.
 const MOST_PER_NODE: f64 = 2.5;
 
 const STARTED: &str = r#"{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":7,"world":[],"revision":1}"#;
 
-/// A node that asks for a resource, has it a moment later, and is at work.
+/// A node that requests a resource, gets it a moment later, and runs.
 fn begins(at: u64, id: u64, attempt: u64, path: &str, resource: &str) -> String {
     let lease = format!(r#"{{"id":{id},"token":1,"resources":[{{"id":"{resource}","kind":"K","endpoint":""}}]}}"#);
     let then = at + 400_000_000;
@@ -47,7 +47,7 @@ fn crashes(at: u64, id: u64, attempt: u64) -> String {
     )
 }
 
-/// A second for each of so many nodes, then the end.
+/// A log in which each of `nodes` nodes takes a second, followed by the end.
 fn log(nodes: u64, node: impl Fn(u64, u64) -> String) -> Vec<LogLine> {
     let text: String = (1..=nodes).map(|id| node(id * 1_000_000_000, id)).collect();
     let end = (nodes + 1) * 1_000_000_000;

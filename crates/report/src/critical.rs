@@ -1,8 +1,8 @@
-//! The critical path: walked backwards from the end of a run, at each moment what everything was waiting for.
+//! The critical path: traced backwards from the end of a run to what the run was waiting for at each moment.
 //!
-//! An instance that ran had waited for the result that let it begin, or for a resource that somebody gave back; there the path goes on. A state that waits
-//! for a condition, a time, a signal or an answer is on it for as long as it waited.
-//! The links lie behind each other in time, and what is between two of them is what the parts of the system took.
+//! An instance that ran had waited for the result that let it begin, or for a resource that was released; the path continues there. A state
+//! that waits for a condition, a time, a signal or an answer is on the path for as long as it waited. The links follow each other in time;
+//! the gaps between them are the latency of the system's parts.
 
 use super::names::{Names, shown};
 use super::timeline::{Behind, Cause, Instance, Phase, Stage, Timeline};
@@ -10,29 +10,29 @@ use ratn_model::id::InstanceId;
 use serde::Serialize;
 use std::fmt::Write as _;
 
-/// A shorter link is not shown to people.
+/// Minimum length of a link that is shown to people.
 const SHORTEST_S: f64 = 0.05;
 
-/// A link: what the run waited for during a time.
+/// A link of the critical path: what the run waited for during an interval.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Link {
-    /// When it begins.
+    /// Its start.
     pub from_s: f64,
-    /// When it ends.
+    /// Its end.
     pub to_s: f64,
-    /// Which instance.
+    /// The path of the instance.
     pub path: String,
-    /// What it was at.
+    /// The instance's stage.
     pub stage: Stage,
-    /// What let it begin.
+    /// What the instance had waited for before.
     pub waited_for: String,
 }
 
-/// From the start of a run to its end. Empty where the run has not ended, or ended by itself.
+/// The critical path from the start of a run to its end. Empty if the run has not ended, or ended by itself.
 pub fn path(run: &Timeline) -> Vec<Link> {
     let mut links = Vec::new();
     let mut at = run.ended_by.instance().and_then(|id| last_phase(run, id, run.end_s));
-    // Each step goes to an earlier phase, so there are no more than there are phases.
+    // Each step goes to an earlier phase, so there are no more steps than phases.
     let bound: usize = run.instances().map(|one| one.phases.len() + 1).sum();
     for _ in 0..bound {
         let Some((instance, index)) = at else { break };
@@ -47,7 +47,7 @@ pub fn path(run: &Timeline) -> Vec<Link> {
 
 type Place<'r> = (&'r Instance, usize);
 
-/// What a phase is on the path, and where the path comes from.
+/// The link of a phase, if any, and the phase from which the path comes.
 fn step<'r>(
     run: &'r Timeline,
     instance: &'r Instance,
@@ -63,7 +63,7 @@ fn step<'r>(
         waited_for,
     };
     match phase.stage {
-        // What it had waited for was under way meanwhile: the path is there.
+        // What the instance had waited for was running meanwhile: the path continues there.
         Stage::Waiting => match &phase.ended_by {
             Cause::Result(id, _) if *id != instance.id => (None, last_phase(run, *id, phase.to_s)),
             Cause::Result(..) => (None, earlier),
@@ -101,7 +101,7 @@ fn step<'r>(
     }
 }
 
-/// What let an instance run that did at last.
+/// The cause that let a running instance begin.
 fn began_on(instance: &Instance, index: usize) -> String {
     let waits = instance.phases[..index].iter().rev().find(|phase| phase.stage == Stage::Waiting);
     let cause = waits.map_or(&instance.expanded_by, |phase| &phase.ended_by);
@@ -111,7 +111,7 @@ fn began_on(instance: &Instance, index: usize) -> String {
     }
 }
 
-/// The phase of an instance that had ended by a moment, last.
+/// The last phase of an instance that had ended by a moment.
 fn last_phase(run: &Timeline, id: InstanceId, to_s: f64) -> Option<Place<'_>> {
     let instance = run.instance(id)?;
     let is_work = |phase: &&Phase| phase.stage != Stage::Finished;
@@ -120,13 +120,13 @@ fn last_phase(run: &Timeline, id: InstanceId, to_s: f64) -> Option<Place<'_>> {
     Some((instance, index))
 }
 
-/// Time goes backwards along the path; where it stands still, so does the order of phases, or that of instances.
+/// Time decreases along the path; at equal times, the order of phases or that of instances does.
 fn is_before((next, to): (&Instance, usize), (instance, index): (&Instance, usize)) -> bool {
     let (next_s, now_s) = (next.phases[to].to_s, instance.phases[index].to_s);
     next_s < now_s || (next_s == now_s && (next.id != instance.id || to < index))
 }
 
-/// As a table for people.
+/// A table for people.
 pub fn table(links: &[Link]) -> String {
     let mut text = String::new();
     if links.is_empty() {

@@ -1,9 +1,9 @@
-//! A Gantt chart of a run, as the paper's Fig. 10: one row per resource, or per state, the robot's seconds to the right. Several runs
-//! stand one below the other on one time axis.
+//! A Gantt chart of a run, as in the paper's Fig. 10: one row per resource, or per state; the horizontal axis is robot time in seconds.
+//! Several runs are shown one below the other on one time axis.
 //!
-//! A bar is a job, coloured by what it is (it moves, it looks, it plans), in three shades so that the visits of a loop can be
-//! told apart. Hatched strips below the bars are waits: instances that had asked for the resource and did not have it yet.
-//! The same timeline gives the same bytes. SVG when the file is named so, else HTML with the statistics below the chart.
+//! A bar is a job, coloured by its activity (motion, detection, planning), in three shades so that the visits of a loop can be
+//! distinguished. Hatched strips below the bars are waits: instances that had requested the resource and did not have it yet. The same
+//! timeline gives the same bytes. SVG if the file is named so, else HTML with the statistics below the chart.
 
 use super::lanes::Lanes;
 use super::statistics::{Statistics, mode_name};
@@ -21,10 +21,10 @@ const TOP: f64 = 86.0;
 const BOTTOM: f64 = 44.0;
 const ROW: f64 = 40.0;
 const BAR: f64 = 24.0;
-/// Waits of at most this many instances are shown below one row.
+/// Maximum number of waiting instances shown below one row.
 const WAIT_LANES: usize = 3;
 const WAIT_LANE: f64 = 4.0;
-/// A shorter wait is the time that asking takes.
+/// Shorter waits are not shown: they are the latency of a request.
 const SHORTEST_WAIT_S: f64 = 0.25;
 /// Mean width of a character in a bar.
 const CHARACTER: f64 = 6.1;
@@ -33,17 +33,17 @@ const PAUSED: &str = "#efe4f7";
 const ABSENT: &str = "#f7dedb";
 const ELSEWHERE: &str = "no resource";
 
-/// What a row is.
+/// What a row shows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum By {
     /// A resource.
     #[default]
     Resource,
-    /// A state; of visits that overlap, each its own row.
+    /// A state; overlapping visits get a row each.
     Node,
 }
 
-/// Writes the chart as the file's name says. `scale_s` makes charts of different runs comparable: where the axis ends.
+/// Writes the chart in the format of the file's name. `scale_s` sets the end of the axis, so that charts of different runs can be compared.
 pub fn write(path: &Path, run: &Timeline, scale_s: Option<f64>) -> std::io::Result<()> {
     write_all(path, &[run], By::Resource, scale_s)
 }
@@ -125,7 +125,7 @@ fn panel(out: &mut String, run: &Timeline, rows: &[Row<'_>], axis: &Axis) {
     for (i, row) in rows.iter().enumerate() {
         row.draw(out, axis, TOP + ROW * i as f64, i % 2 == 1);
     }
-    // The end of the run, where the axis goes on.
+    // The end of the run, if the axis continues after it.
     let x = axis.x(run.end_s);
     let _ = writeln!(
         out,
@@ -134,7 +134,7 @@ fn panel(out: &mut String, run: &Timeline, rows: &[Row<'_>], axis: &Axis) {
     );
 }
 
-/// A time from top to bottom.
+/// A band over the whole height for an interval.
 fn band(out: &mut String, axis: &Axis, bottom: f64, span: Span, colour: &str, what: &str) {
     let (x, width) = (axis.x(span.from_s), (axis.x(span.to_s) - axis.x(span.from_s)).max(1.0));
     let _ = writeln!(
@@ -181,7 +181,7 @@ impl Axis {
         LEFT + (WIDTH - LEFT - RIGHT) * seconds / self.end_s
     }
 
-    /// 1, 2 or 5 times a power of ten.
+    /// The distance of the ticks: 1, 2 or 5 times a power of ten.
     fn step(&self) -> f64 {
         let rough = self.end_s / TICKS;
         let power = 10_f64.powf(rough.log10().floor());
@@ -212,7 +212,7 @@ impl Axis {
 }
 
 struct Row<'a> {
-    /// The resource, or the state.
+    /// The name of the resource or state.
     name: String,
     jobs: Vec<(&'a Instance, &'a Job)>,
     waits: Vec<(&'a Instance, f64, f64)>,
@@ -229,7 +229,7 @@ fn rows(run: &Timeline, by: By) -> Vec<Row<'_>> {
     rows
 }
 
-/// What moves first, then what looks, then what plans; within these by name.
+/// Rows by activity: motion first, then detection, then planning; within these by name.
 fn by_resource(run: &Timeline) -> Vec<Row<'_>> {
     let mut rows: BTreeMap<&str, Row<'_>> = BTreeMap::new();
     for (instance, job) in run.jobs() {
@@ -251,7 +251,7 @@ fn by_resource(run: &Timeline) -> Vec<Row<'_>> {
     rows
 }
 
-/// In the order in which the states were first visited.
+/// Rows in the order in which the states were first visited.
 fn by_node(run: &Timeline) -> Vec<Row<'_>> {
     let mut states: Vec<(Lanes, Vec<Row<'_>>)> = Vec::new();
     let mut places: BTreeMap<String, usize> = BTreeMap::new();
@@ -370,7 +370,7 @@ fn draw_job(out: &mut String, axis: &Axis, y: f64, instance: &Instance, job: &Jo
     out.push_str("</g>\n");
 }
 
-/// Pale enough for dark text on them.
+/// Pale colours, so that dark text is readable on them.
 fn colour(activity: Activity, shade: usize) -> &'static str {
     let shades = match activity {
         Activity::Motion => ["#8fb8e8", "#b3d0f2", "#74a3da"],
@@ -404,7 +404,7 @@ fn shortened(text: &str, characters: usize) -> String {
     text.chars().take(characters.saturating_sub(1)).chain(['…']).collect()
 }
 
-/// A text in XML, which allows neither control characters nor the last two of the plane.
+/// Escapes a text for XML, which allows neither control characters nor U+FFFE and U+FFFF.
 fn escaped(text: &str) -> String {
     let text = readable(text).replace(['\u{fffe}', '\u{ffff}'], "\u{fffd}");
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")

@@ -1,11 +1,12 @@
-//! Spans that overlap, laid into lanes in which they do not.
+//! Assigns overlapping spans to lanes, so that no two spans in a lane overlap.
 
 /// The lanes of one track.
 #[derive(Debug, Clone)]
 pub struct Lanes {
-    /// How many there are.
+    /// Number of lanes.
     count: usize,
-    /// A tree: at `places + lane` until when that lane is taken, infinite for one in use or not there yet; at `n` the earlier of `2n` and `2n + 1`.
+    /// A tree of minima. At `places + lane`: until when that lane is taken, infinite for a lane in use or not yet existing; at `n`: the
+    /// minimum of `2n` and `2n + 1`.
     taken_to_s: Vec<f64>,
     places: usize,
 }
@@ -17,9 +18,9 @@ impl Default for Lanes {
 }
 
 impl Lanes {
-    /// The first lane that is free from a moment on, taken until another one; its number, and whether it is new.
+    /// Takes the first lane that is free from `from_s` on, until `to_s`; returns its number, and whether it is new.
     pub fn take(&mut self, from_s: f64, to_s: f64) -> (usize, bool) {
-        // Moments of a log are whole nanoseconds.
+        // Times in a log are whole nanoseconds.
         let is_free = |taken_to_s: f64| taken_to_s <= from_s + 1e-10;
         let is_new = !is_free(self.taken_to_s[1]);
         let mut at = 1;
@@ -35,7 +36,7 @@ impl Lanes {
         (lane, is_new)
     }
 
-    /// A lane is free from a moment on.
+    /// Frees a lane from `at_s` on.
     pub fn free(&mut self, lane: usize, at_s: f64) {
         let mut at = self.places + lane;
         self.taken_to_s[at] = at_s;

@@ -1,9 +1,9 @@
-//! What an event log tells of a run: its timeline, its statistics, its critical path and its Gantt chart.
+//! Evaluates an event log: the run's timeline, statistics, critical path and Gantt chart.
 //!
-//! It owns the fold of a log's lines into what each instance did when and why ([`timeline`]), the figures made of that ([`statistics`]),
-//! what the run waited for ([`critical`], [`waiting`]), what several runs have in common ([`report`]) and the chart drawn of them
-//! ([`gantt`]), where spans that overlap stand in [`lanes`]; which motions there were ([`motions`]) and what the world was believed to be ([`believed`]). It needs no task file, no system that runs and no network, and prints nothing: the same
-//! lines give the same bytes. Reading the lines from a file is `ratn_event_log`'s.
+//! This crate folds the lines of a log into what each instance did when and why ([`timeline`]). From that it computes figures
+//! ([`statistics`]), what the run waited for ([`critical`], [`waiting`]), a comparison of several runs ([`report`]) and charts ([`gantt`],
+//! with overlapping spans in [`lanes`]); also the motions ([`motions`]) and the world as believed ([`believed`]). It needs no task file, no
+//! running system and no network, and prints nothing: the same lines give the same bytes. `ratn_event_log` reads the lines from a file.
 
 pub mod believed;
 #[cfg(test)]
@@ -54,7 +54,7 @@ mod tests {
         assert!((sum - statistics.makespan_s).abs() < 1e-9);
     }
 
-    /// Paused and stepped, a motion beside another, a result that did not count, and task control gone for a while.
+    /// A log with pauses and steps, two motions at once, a result that was invalidated, and a time without task control.
     fn incidents() -> Timeline {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/fixtures/incidents.jsonl");
         Timeline::of(&log::read(&path).unwrap().lines)
@@ -72,7 +72,7 @@ mod tests {
         ");
     }
 
-    /// A log of one run: a look ahead on two branches, of which the second takes the result of the first, and a label that is read.
+    /// A log of one run: a look ahead on two branches, of which the second reuses the result of the first, and a label that is read.
     fn told(lines: &str) -> Timeline {
         let lines: Vec<LogLine> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
         Timeline::of(&lines)
@@ -126,7 +126,7 @@ mod tests {
         }
     }
 
-    /// `look`, then `plan`, which waits until `other` gives back the only planner, then `move` along that plan.
+    /// `look`, then `plan`, which waits until `other` releases the only planner, then `move` along that plan.
     const CHAIN: &str = r#"{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":7,"world":[],"revision":1,"capacity":{"PathPlanner":1},"origin":{"run":"r","natures":{"computes":["plan","other"],"actuating":["Arm"]}}}
 {"at":0,"command":"note","note":"expanded","instance":1,"state":1,"path":"look","speculative":false}
 {"at":0,"command":"note","note":"expanded","instance":2,"state":2,"path":"other","speculative":false}
@@ -165,15 +165,15 @@ mod tests {
           move                       6.2     9.0     2.8  running      plan
           9.0 s in 5 links, 0 of them shorter than 0.05 s and not shown
         ");
-        // Nothing is on it twice, and nothing of it overlaps.
+        // No link occurs twice, and no two overlap.
         for run in [told(CHAIN), two_boxes(), incidents(), told(WITH_A_LABEL)] {
             let links = critical::path(&run);
             assert!(links.windows(2).all(|pair| pair[0].to_s <= pair[1].from_s + 1e-9), "{links:?}");
         }
     }
 
-    /// `move`, then `ready`, which waits until somebody else changes the world, then `turn`, then `rest`, which waits for its time. All are in the window
-    /// from the beginning.
+    /// `move`, then `ready`, which waits until the world is changed from outside, then `turn`, then `rest`, which waits for a time. All are
+    /// in the window from the beginning.
     const WAITS: &str = r#"{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":7,"world":[],"revision":1,"capacity":{},"origin":{"run":"r","natures":{"computes":[],"actuating":["Arm"]}}}
 {"at":0,"command":"note","note":"expanded","instance":1,"state":1,"path":"move","speculative":false}
 {"at":0,"command":"note","note":"expanded","instance":2,"state":2,"path":"ready","speculative":false}
@@ -216,7 +216,7 @@ mod tests {
         ");
     }
 
-    /// A log whose names steer a terminal, turn the text around them, are markup, and are too long for a table.
+    /// A log whose names contain terminal control codes, reverse the text direction, are markup, and are too long for a table.
     #[test]
     fn names_of_a_hostile_log_do_nothing_and_leave_a_table_readable() {
         let evil = "\u{1b}[2J\r\u{202e}\u{7}\u{ffff}<b>";
@@ -277,7 +277,7 @@ mod tests {
         t          HSM    1/2  12.0 ± 0.0         12.0     12.0  2.0 ± 0.0       3.9 ± 0.0
         t: CDTN is 25.0 % shorter than HSM
         ");
-        // With other parameters it is another task.
+        // Runs with other parameters are not grouped together.
         runs[0].parameters.insert("boxes".to_owned(), ratn_model::value::Value::Int(3));
         let together = report::repeated(&runs);
         assert_eq!(

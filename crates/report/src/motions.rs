@@ -1,8 +1,8 @@
-//! Where joints are, as a log tells it: which motion began when along which trajectory, or to which posture, and what drivers said of where
-//! arm, head and fingers ended.
+//! Joint positions from a log: which motion began along which trajectory, or to which posture, and where arm, head and fingers ended
+//! according to their drivers.
 //!
-//! Positions are as commanded, not as measured. It knows no robot: the joints of a trajectory have the names that the trajectory gives
-//! them. Pure: the same lines give the same motions.
+//! Positions are commanded, not measured. The module knows no robot: joint names come from the trajectory. Pure: the same lines give the
+//! same motions.
 
 use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine};
 use ratn_model::id::InstanceId;
@@ -10,13 +10,13 @@ use ratn_model::program::SUCCESS;
 use ratn_model::value::{Trajectory, TrajectoryPoint, Value};
 use std::collections::BTreeMap;
 
-/// The port in which a driver says where its joints ended.
+/// The output port with the final joint positions.
 const END: &str = "end";
-/// The port of a posture: a driver is told it without a way to it, or says it.
+/// The port of a posture, without a trajectory: an input or an output of a driver.
 const POSTURE: &str = "joints";
-/// Who opens its fingers without saying how far.
+/// The action that opens the fingers without giving a width.
 const RELEASE: (&str, &str) = ("gripper", "release");
-/// In the id of a resource of a robot with several arms the arm's name stands between these.
+/// For a robot with several arms, the arm's name is between these two parts of the id of a resource.
 const ARM_OF: [(&str, char); 2] = [("arm_", '@'), ("gripper_", '@')];
 
 /// The motions under way.
@@ -25,7 +25,7 @@ pub struct Motions {
     jobs: BTreeMap<InstanceId, Job>,
 }
 
-/// What a driver was given.
+/// A goal that a driver got.
 #[derive(Debug)]
 struct Job {
     arm: Option<String>,
@@ -33,63 +33,63 @@ struct Job {
     motion: Option<Motion>,
 }
 
-/// A motion that was given to a driver.
+/// A motion of a driver.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Motion {
     /// When it began, in seconds of the run.
     pub from_s: f64,
-    /// Where it goes.
+    /// Its trajectory or target.
     pub way: Way,
-    /// How long it is expected to take, in seconds, where the task says so.
+    /// Its expected duration in seconds, if the task gives one.
     pub expected_s: Option<f64>,
-    /// The name of the arm, where the goal or its lease says one: a robot with one arm has no names.
+    /// The arm's name, if the goal or its lease names one: the arm of a robot with one arm has no name.
     pub arm: Option<String>,
 }
 
-/// Where a motion goes.
+/// The trajectory or target of a motion.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Way {
     /// Along a trajectory of at least one point.
     Along(Trajectory),
-    /// To these positions of an arm; the driver chooses the way.
+    /// To these positions of an arm; the driver chooses the trajectory.
     To(Vec<f64>),
 }
 
-/// What a line says of where joints are.
+/// A change of joint positions.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Change<'m> {
     /// A motion begins.
     Begins(InstanceId, &'m Motion),
-    /// A motion is over, at these positions where the driver has said so.
+    /// A motion ends; with the final positions if the driver reported them.
     Ends(InstanceId, Motion, Option<&'m [f64]>),
     /// An arm is at these positions.
     Stands {
-        /// Its name.
+        /// The arm's name.
         arm: Option<String>,
-        /// Its joints.
+        /// Its joint positions.
         at: &'m [f64],
     },
-    /// The head looks there, in radians.
+    /// The head has this direction, in radians.
     Looks {
         /// Positive to the left.
         pan: f64,
         /// Positive downwards.
         tilt: f64,
     },
-    /// The fingers of an arm are open so far, or as far as they can be.
+    /// The fingers of an arm are open by this width.
     Fingers {
         /// The arm's name.
         arm: Option<String>,
-        /// Between the fingers, in metres.
+        /// The distance between the fingers, in metres; `None`: fully open.
         width_m: Option<f64>,
     },
 }
 
 impl Motions {
-    /// What a line says of where joints are.
+    /// The change of joint positions by a line, if any.
     pub fn follow<'m>(&'m mut self, line: &'m LogLine) -> Option<Change<'m>> {
         match &line.entry {
-            // What works on a projection moves nothing.
+            // A goal on a projection moves nothing.
             LogEntry::Command(Command::Start { instance, goal, .. }) if goal.projection.is_none() => {
                 let arm = arm(goal);
                 let motion = way(goal).map(|way| Motion {
@@ -138,13 +138,13 @@ fn way(goal: &Goal) -> Option<Way> {
     });
     match (trajectory, goal.inputs.get(POSTURE)) {
         (Some(trajectory), _) => (!trajectory.points.is_empty()).then(|| Way::Along(trajectory.clone())),
-        // Who holds nothing moves nothing.
+        // A goal without a lease moves nothing.
         (None, Some(Value::Joints(positions))) if goal.lease.is_some() => Some(Way::To(positions.clone())),
         _ => None,
     }
 }
 
-/// Which arm a goal is for, where it or the one arm in its lease says so.
+/// The name of the arm that a goal is for, from the goal or from the one arm in its lease.
 fn arm(goal: &Goal) -> Option<String> {
     if let Some(Value::String(arm)) = goal.inputs.get("arm") {
         return Some(arm.clone());
@@ -160,7 +160,7 @@ fn arm(goal: &Goal) -> Option<String> {
     (arms.len() == 1).then(|| arms.remove(0))
 }
 
-/// Positions and velocities of a trajectory after so many seconds: at its points as they are, straight between two of them.
+/// Positions and velocities of a trajectory after `after_s` seconds: at its points as given, between two points linear.
 pub fn place(trajectory: &Trajectory, after_s: f64) -> (Vec<f64>, Vec<f64>) {
     let next = trajectory.points.partition_point(|point| point.time_s <= after_s);
     let Some(before) = trajectory.points.get(next.saturating_sub(1)) else { return Default::default() };
@@ -172,7 +172,7 @@ pub fn place(trajectory: &Trajectory, after_s: f64) -> (Vec<f64>, Vec<f64>) {
     (between(&before.positions, &behind.positions), between(&before.velocities, &behind.velocities))
 }
 
-/// At most so many points of a trajectory, evenly chosen, its first and its last one among them.
+/// At most `most` points of a trajectory, evenly chosen, including its first and its last one.
 pub fn thinned(points: &[TrajectoryPoint], most: usize) -> Vec<&TrajectoryPoint> {
     if points.len() <= most.max(2) {
         return points.iter().collect();

@@ -1,32 +1,32 @@
-//! Names of a log in a column of a table: readable, and none so long that the columns behind it are out of sight.
+//! Names from a log for a column of a table: readable, and short enough that the following columns stay visible.
 
 use ratn_model::readable::in_line;
 
-/// Of a name with more characters the middle is left out.
+/// Maximum number of characters of a name; of a longer one, the middle is omitted.
 const MOST: usize = 100;
 
-/// A column of names, each ready to stand in it.
+/// A column of names, each ready to be shown.
 pub(crate) struct Names {
     names: Vec<String>,
-    /// Of the longest one, or of what was given.
+    /// Width of the longest name, or the given minimum.
     pub(crate) width: usize,
 }
 
 impl Names {
-    /// A column that is at least so wide.
+    /// A column that has at least the width `least`.
     pub(crate) fn of<'n>(names: impl IntoIterator<Item = &'n str>, least: usize) -> Names {
         let names: Vec<String> = names.into_iter().map(shown).collect();
         let width = names.iter().map(|name| name.chars().count()).max().unwrap_or(0).max(least);
         Names { names, width }
     }
 
-    /// In the order in which they were given.
+    /// The names in the given order.
     pub(crate) fn iter(&self) -> impl Iterator<Item = &str> {
         self.names.iter().map(String::as_str)
     }
 }
 
-/// A name as it stands in a line of a table.
+/// A name in the form for a line of a table.
 pub(crate) fn shown(name: &str) -> String {
     let name = in_line(name);
     let all = name.chars().count();

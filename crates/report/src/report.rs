@@ -1,4 +1,4 @@
-//! All that is said of one run, and what several runs have in common.
+//! The report on one run, and the comparison of several runs.
 
 use super::critical::{self, Link};
 use super::names::{Names, shown};
@@ -10,24 +10,24 @@ use ratn_model::program::SUCCESS;
 use serde::Serialize;
 use std::fmt;
 
-/// Of one run.
+/// The report on one run.
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
-    /// Where the time went.
+    /// How the time was spent.
     #[serde(flatten)]
     pub statistics: Statistics,
     /// What the run waited for, from its start to its end.
     pub critical_path: Vec<Link>,
     /// What instances waited for.
     pub waiting: Vec<Waiting>,
-    /// What work ahead of time was good for.
+    /// The benefit of speculative work.
     pub speculation: Speculation,
-    /// What results gained that got better after they were given.
+    /// The gain from results that improved after they were first given.
     pub improvement: Improvement,
 }
 
 impl Report {
-    /// Reads it off a timeline.
+    /// Makes the report from a timeline.
     pub fn of(run: &Timeline) -> Report {
         Report {
             statistics: Statistics::of(run),
@@ -66,37 +66,37 @@ impl fmt::Display for Report {
 pub struct Repeated {
     /// The task.
     pub task: String,
-    /// Its parameters in which the runs of this task differ, `boxes=3`.
+    /// Its parameters in which the runs of this task differ, for example `boxes=3`.
     pub with: Vec<String>,
-    /// How it was executed.
+    /// The execution mode.
     pub mode: Mode,
-    /// How many runs.
+    /// Number of runs.
     pub runs: usize,
-    /// How many of them ended with success.
+    /// Number of runs that ended with success.
     pub successes: usize,
-    /// Of those: their makespans.
+    /// Makespans of the successful runs.
     pub makespan_s: Spread,
-    /// How long at least two jobs ran at once.
+    /// How long at least two jobs ran concurrently.
     pub overlap_s: Spread,
-    /// How long planning was waited for.
+    /// How long the run waited for planning.
     pub planning_waited_for_s: Spread,
 }
 
-/// A figure of several runs.
+/// The spread of a figure over several runs.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Spread {
     /// The mean.
     pub mean: f64,
-    /// The standard deviation of the runs as a sample; 0 of fewer than two.
+    /// The sample standard deviation; 0 for fewer than two runs.
     pub deviation: f64,
-    /// The least.
+    /// The minimum.
     pub least: f64,
-    /// The largest.
+    /// The maximum.
     pub largest: f64,
 }
 
 impl Spread {
-    /// Of figures; all 0 of none.
+    /// The spread of these figures; all zero without figures.
     pub fn of(figures: &[f64]) -> Spread {
         let Some(first) = figures.first() else { return Spread::default() };
         let number = figures.len() as f64;
@@ -108,7 +108,7 @@ impl Spread {
     }
 }
 
-/// Runs of the same task with the same parameters in the same mode together, in the order of their first ones.
+/// Groups runs of the same task with the same parameters in the same mode, in the order of their first runs.
 pub fn repeated(runs: &[Timeline]) -> Vec<Repeated> {
     let mut kinds: Vec<&Timeline> = Vec::new();
     for run in runs {
@@ -148,13 +148,13 @@ fn is_alike(a: &Timeline, b: &Timeline) -> bool {
 }
 
 impl Repeated {
-    /// `fetch_boxes`, and with which parameters where there are runs with others.
+    /// The task's name, for example `fetch_boxes`, with its parameters if there are runs with other ones.
     fn name(&self) -> String {
         if self.with.is_empty() { self.task.clone() } else { format!("{} ({})", self.task, self.with.join(", ")) }
     }
 }
 
-/// As a table for people, with how much shorter CDTN is where there are both.
+/// A table for people, with the relative gain of CDTN if there are runs of both modes.
 pub fn table(all: &[Repeated]) -> String {
     let whole: Vec<String> = all.iter().map(Repeated::name).collect();
     let names = Names::of(whole.iter().map(String::as_str), 10);

@@ -1,7 +1,7 @@
-//! Where the time of a run went.
+//! How the time of a run was spent.
 //!
 //! Every moment of a run counts once in [`Shares`]: to motion if anything moves, else to detection, else to other work, else to planning
-//! that everything waits for, else to idleness; they add up to the makespan.
+//! that everything waits for, else to idle time; the shares add up to the makespan.
 
 use super::names::{Names, shown};
 use super::timeline::{Activity, Ending, Job, Span, Timeline};
@@ -13,34 +13,34 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::fmt::{self, Write as _};
 
-/// What a log says in numbers. Times are in the robot's seconds.
+/// The figures of a log. Times are in seconds of robot time.
 #[derive(Debug, Clone, Serialize)]
 pub struct Statistics {
     /// The task.
     pub task: String,
-    /// How it was executed.
+    /// The execution mode.
     pub mode: Mode,
-    /// `None` when the log ends before the run does.
+    /// `None` if the log ends before the run does.
     pub outcome: Option<String>,
-    /// Why it ended so; empty for a success.
+    /// The reason of the outcome; empty for success.
     pub reason: String,
     /// From the start of the run to its end.
     pub makespan_s: f64,
-    /// Where the time went.
+    /// How the time was spent.
     pub time: Shares,
-    /// All jobs' durations added up.
+    /// Sum of the durations of all jobs.
     pub work_s: f64,
-    /// How long at least two jobs ran at once.
+    /// How long at least two jobs ran concurrently.
     pub overlap_s: f64,
-    /// How long no PIA was to begin, because the user paused the run.
+    /// How long no PIA could begin, because the user had paused the run.
     pub paused_s: f64,
-    /// How many single steps the user asked for.
+    /// Number of single steps by the user.
     pub steps: usize,
-    /// How long task control was gone; what ran then went on or was stopped by its provider.
+    /// How long task control was gone; jobs under way then went on, or were stopped by their provider.
     pub away_s: f64,
     /// PIAs that began beside an older one whose exceptions are imprecise.
     pub imprecise: Vec<ImpreciseOverlap>,
-    /// What became of the visits of states.
+    /// Numbers of instances by what became of them.
     pub instances: Instances,
     /// Work on projected worlds.
     pub ahead_of_time: AheadOfTime,
@@ -52,19 +52,19 @@ pub struct Statistics {
     pub plans: Vec<Plan>,
 }
 
-/// The makespan, divided.
+/// The makespan, divided by activity.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
 pub struct Shares {
-    /// Something moved.
+    /// Motion.
     pub motion_s: f64,
-    /// Something was looked at, and nothing moved.
+    /// Detection, without motion.
     pub detection_s: f64,
-    /// What neither moves the robot nor looks nor computes.
+    /// Work that is neither motion nor detection nor computing.
     #[serde(skip_serializing_if = "is_nothing")]
     pub other_s: f64,
-    /// Only planning went on, and everything else waited for that.
+    /// Only planning ran, and everything else waited for it.
     pub planning_waited_for_s: f64,
-    /// Nothing went on.
+    /// Nothing ran.
     pub idle_s: f64,
 }
 
@@ -72,33 +72,33 @@ fn is_nothing(seconds: &f64) -> bool {
     *seconds == 0.0
 }
 
-/// How many instances there were.
+/// Numbers of instances.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
 pub struct Instances {
     /// All of them.
     pub expanded: usize,
-    /// Those that have become real.
+    /// Retired instances.
     pub retired: usize,
-    /// Those that were discarded.
+    /// Squashed (discarded) instances.
     pub squashed: usize,
     /// Attempts that ended without an answer.
     pub crashed_attempts: usize,
-    /// How often a result did not count because something came out otherwise.
+    /// Number of results that were invalidated because something turned out differently.
     pub invalidated: usize,
-    /// How many took the result of an equal one.
+    /// Number of instances that reused the result of an equal one.
     pub reused: usize,
 }
 
-/// A PIA that began while another one with imprecise exceptions ran.
+/// A PIA that began while another PIA with imprecise exceptions ran.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ImpreciseOverlap {
-    /// What ran, and might have failed.
+    /// Path of the older PIA, which might have failed.
     pub older: String,
-    /// What began, and would have stood.
+    /// Path of the younger PIA, whose effects would have stayed.
     pub younger: String,
 }
 
-/// Computing and detecting jobs that began before an instance that was expanded earlier had finished.
+/// Computing and detecting jobs that began before an earlier expanded instance had finished.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
 pub struct AheadOfTime {
     /// Jobs whose results were used.
@@ -107,53 +107,53 @@ pub struct AheadOfTime {
     pub squashed: usize,
 }
 
-/// How much of the run a resource was in use.
+/// How long a resource was in use.
 #[derive(Debug, Clone, Serialize)]
 pub struct Busy {
     /// Its id.
     pub resource: String,
     /// How long a job held it.
     pub busy_s: f64,
-    /// The same as a part of the makespan.
+    /// The same as a fraction of the makespan.
     pub share: f64,
 }
 
-/// What the visits of one state took together.
+/// The times of one state, all visits together.
 #[derive(Debug, Clone, Serialize)]
 pub struct StateTime {
     /// Its path without visit numbers.
     pub state: String,
-    /// How many of its jobs have run.
+    /// Number of its jobs that have run.
     pub runs: usize,
-    /// Of all of them together.
+    /// Total duration of these jobs.
     pub total_s: f64,
-    /// Of the longest.
+    /// Duration of the longest job.
     pub longest_s: f64,
-    /// Waiting for resources to be granted.
+    /// Waiting time for resources.
     pub waited_s: f64,
 }
 
-/// What a planner did with its time.
+/// How a planner used its time.
 #[derive(Debug, Clone, Serialize)]
 pub struct Plan {
     /// The instance's path.
     pub instance: String,
     /// The planner.
     pub resource: String,
-    /// When the first path was found, after the planner began.
+    /// Time from the planner's start to the first path.
     pub first_path_s: f64,
     /// The length of the first path in joint space.
     pub first_length_rad: f64,
-    /// The length of the path that was given.
+    /// The length of the resulting path.
     pub length_rad: f64,
-    /// How long the planner worked.
+    /// The planning time.
     pub planning_s: f64,
     /// By how much the rest of the budget shortened the first path, in percent.
     pub shortened_percent: f64,
 }
 
 impl Statistics {
-    /// Reads them off a timeline.
+    /// Computes the statistics from a timeline.
     pub fn of(run: &Timeline) -> Statistics {
         let jobs: Vec<&Job> = run.jobs().map(|(_, job)| job).collect();
         let (time, overlap_s) = divide(run.end_s, &jobs);
@@ -164,7 +164,7 @@ impl Statistics {
             reason: run.reason.clone(),
             makespan_s: run.end_s,
             time,
-            // The sum of nothing would be -0.
+            // The sum of an empty sequence would be -0.
             work_s: jobs.iter().map(|job| job.to_s - job.from_s).fold(0.0, |all, one| all + one),
             overlap_s,
             paused_s: run.pauses.iter().map(Span::length_s).fold(0.0, |all, one| all + one),
@@ -191,7 +191,7 @@ impl Statistics {
     }
 }
 
-/// Sweeps over the ends of all jobs; between two of them nothing changes.
+/// Sweeps over the starts and ends of all jobs; between two of them nothing changes.
 fn divide(end_s: f64, jobs: &[&Job]) -> (Shares, f64) {
     let lasting = jobs.iter().filter(|job| job.to_s > job.from_s);
     let mut edges: Vec<(f64, Option<(usize, bool)>)> = lasting
@@ -201,7 +201,7 @@ fn divide(end_s: f64, jobs: &[&Job]) -> (Shares, f64) {
         .chain([(end_s, None)])
         .collect();
     edges.sort_by(|a, b| a.0.total_cmp(&b.0));
-    // How many run, and how long the first one of those that do did, by activity; behind these what goes on without any.
+    // By activity: number of running jobs and accumulated time of the first activity with a running job; the last entry is idle time.
     let (mut running, mut spent_s) = ([0_usize; 4], [0.0; 5]);
     let (mut from_s, mut overlap_s) = (0.0, 0.0);
     for (at_s, edge) in edges {
@@ -347,7 +347,7 @@ impl fmt::Display for Statistics {
 }
 
 impl Statistics {
-    /// What does not happen in most runs.
+    /// Events that do not happen in most runs.
     fn incidents(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Instances { invalidated, reused, .. } = self.instances;
         if invalidated > 0 || reused > 0 {
@@ -370,7 +370,7 @@ impl Statistics {
     }
 }
 
-/// What the planners did with their time; empty without plans.
+/// A table of the plans for people; empty without plans.
 pub fn plan_table(plans: &[Plan]) -> String {
     let mut text = String::new();
     if plans.is_empty() {

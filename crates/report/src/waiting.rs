@@ -1,4 +1,4 @@
-//! What instances waited for, by cause: resources by who held them, results by whose, and the rest.
+//! What instances waited for, by cause: resources by their holders, results by their instances, and the rest.
 
 use super::names::Names;
 use super::timeline::{Cause, Phase, Stage, Timeline};
@@ -7,25 +7,25 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-/// So many causes are shown to people.
+/// Maximum number of causes shown to people.
 const MOST_SHOWN: usize = 12;
-/// A shorter wait is the time that asking takes.
+/// Shorter waits are not counted: they are the latency of a request.
 const SHORTEST_S: f64 = 0.05;
 
 /// All waits of one cause.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Waiting {
-    /// What was waited for.
+    /// The cause.
     pub cause: String,
-    /// How often.
+    /// Number of waits.
     pub times: usize,
-    /// How long, of all instances together.
+    /// Total duration, of all instances together.
     pub total_s: f64,
     /// The longest.
     pub longest_s: f64,
 }
 
-/// By cause, that with the longest time first. Instances that were discarded are not counted.
+/// The waits by cause, the largest total first. Instances that were discarded are not counted.
 pub fn by_cause(run: &Timeline) -> Vec<Waiting> {
     let mut by: BTreeMap<String, Waiting> = BTreeMap::new();
     let mut add = |cause: String, length_s: f64| {
@@ -63,7 +63,7 @@ pub fn by_cause(run: &Timeline) -> Vec<Waiting> {
     all
 }
 
-/// As a table for people.
+/// A table for people.
 pub fn table(all: &[Waiting]) -> String {
     let mut text = String::new();
     if all.is_empty() {

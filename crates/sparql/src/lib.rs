@@ -1,8 +1,8 @@
-//! SPARQL over triples: `SELECT` and `ASK`, answered over a dataset that is built for one query.
+//! SPARQL over triples: `SELECT` and `ASK`, evaluated over a dataset that is built for one query.
 //!
-//! A crate of its own because the evaluator is large and one option of one command uses it: `ratn world query --sparql`, in a `ratn`
-//! that is built with the feature `sparql`. It knows nothing of facts: its caller says which triples there are, and which prefixes.
-//! Bounded: by the length and the nesting of the text, by the time that an answer may take, and by the number of rows.
+//! A crate of its own, because the evaluator is large and only one option of one command uses it: `ratn world query --sparql`, in a `ratn`
+//! that is built with the feature `sparql`. It knows nothing of facts: its caller supplies the triples and the prefixes. There are limits
+//! for the length and the nesting of the query, the time of the evaluation, and the number of rows.
 
 use oxrdf::vocab::xsd;
 use oxrdf::{Dataset, GraphName, IriParseError, Term, Triple};
@@ -11,28 +11,28 @@ use spargebra::{SparqlParser, SparqlSyntaxError};
 use std::sync::mpsc;
 use std::time::Duration;
 
-/// The longest query, in bytes.
+/// Maximum length of a query, in bytes.
 pub const MAX_TEXT: usize = 16 * 1024;
-/// How deep parentheses, braces and brackets may stand in each other.
+/// Maximum nesting depth of parentheses, braces and brackets.
 pub const MAX_NESTING: usize = 48;
-/// The longest time that an answer may take.
+/// Time limit of the evaluation.
 pub const DEADLINE: Duration = Duration::from_secs(10);
-/// The stack of the thread that answers, in bytes: a long query is a deep tree.
+/// Stack size of the evaluating thread, in bytes: a long query is a deep tree.
 const STACK: usize = 256 << 20;
 
 /// The answer to a query.
 #[derive(Debug, PartialEq)]
 pub enum Answer {
-    /// Of a `SELECT`.
+    /// The result of a `SELECT`.
     Rows {
         /// The names of the variables, in the order of the query.
         variables: Vec<String>,
-        /// For each row what each variable is, if it is bound.
+        /// The rows: for each variable its value, if it is bound.
         rows: Vec<Vec<Option<Term>>>,
         /// Whether there are more rows than the limit.
         more: bool,
     },
-    /// Of an `ASK`.
+    /// The result of an `ASK`.
     Truth(bool),
 }
 
@@ -42,33 +42,33 @@ pub enum QueryError {
     /// The text is too long.
     #[error("the query is longer than {MAX_TEXT} bytes")]
     TooLong,
-    /// The text is nested too deep.
+    /// The text is nested too deeply.
     #[error("the query is nested deeper than {MAX_NESTING}")]
     TooDeep,
-    /// A prefix that the caller gives is no IRI.
+    /// A prefix from the caller is not an IRI.
     #[error("the prefix `{0}` is no IRI")]
     Prefix(String, #[source] IriParseError),
-    /// The text is no query.
+    /// The text is not a SPARQL query.
     #[error("not SPARQL")]
     NotSparql(#[source] SparqlSyntaxError),
-    /// The evaluator gave up.
+    /// The evaluation failed.
     #[error("the query cannot be answered")]
     Evaluation(#[source] QueryEvaluationError),
-    /// The query asks for triples.
+    /// The query asks for triples, which is not supported.
     #[error("SELECT and ASK are answered; for all facts there is `ratn world dump`")]
     Graph,
-    /// The answer took too long, and was given up.
+    /// The evaluation exceeded its time limit, and was stopped.
     #[error("the answer takes longer than {0} s: ask for less")]
     Late(u64),
-    /// No thread could be started for the answer.
+    /// The evaluating thread could not be started.
     #[error("no thread could be started for the query")]
     Thread(#[source] std::io::Error),
 }
 
-/// Answers `query` over `triples`, with at most `limit` rows. `prefixes` are known to the query: name and IRI.
+/// Evaluates `query` over `triples`, with at most `limit` rows. `prefixes` (name and IRI) can be used in the query.
 ///
 /// # Errors
-/// What is wrong with the query, or that it takes too long.
+/// The fault of the query, or that the evaluation takes too long.
 pub fn answer(
     query: &str,
     prefixes: &[(&str, &str)],
@@ -140,7 +140,7 @@ fn evaluate(
     Ok(Answer::Rows { variables, rows, more })
 }
 
-/// How deep parentheses, braces and brackets stand in each other at the most; those in texts count, too.
+/// The maximum nesting depth of parentheses, braces and brackets; those within string literals count, too.
 fn nesting(text: &str) -> usize {
     let (mut depth, mut deepest) = (0_usize, 0);
     for character in text.chars() {
@@ -154,7 +154,7 @@ fn nesting(text: &str) -> usize {
     deepest
 }
 
-/// A term for people: texts and numbers as they are, everything else as RDF writes it.
+/// A term for people: texts and numbers as they are, everything else in RDF's notation.
 #[must_use]
 pub fn shown(term: &Term) -> String {
     match term {
@@ -243,7 +243,7 @@ mod tests {
         }
         let chain = format!("ASK {{ FILTER ({} true) }}", "false || ".repeat(1_500));
         assert_eq!(asked(&chain, 1).unwrap(), Answer::Truth(true));
-        // An answer that nobody would wait for.
+        // A query whose evaluation would take far too long.
         let product: String = ('a'..='h').map(|v| format!("?{v}1 ?{v}2 ?{v}3 . ")).collect();
         let query = format!("SELECT (COUNT(*) AS ?n) {{ {product} }}");
         let refused = within(&query, &PREFIXES, kitchen(), 1, Duration::from_millis(50)).unwrap_err().to_string();

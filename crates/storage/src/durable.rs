@@ -9,20 +9,20 @@ use std::task::{Context, Poll, Wake, Waker};
 use std::thread::{self, Thread};
 use tokio::sync::watch;
 
-/// How far a writer has come.
+/// The progress of a log's writer.
 #[derive(Debug, Clone, Default)]
 pub struct Progress {
-    /// All records through this one are on the disk (with [`crate::Durability::None`]: were appended).
+    /// All records through this one are durable (with [`crate::Durability::None`]: appended).
     pub durable: Position,
-    /// The last snapshot stands for all records through this one.
+    /// The last snapshot replaces all records through this one.
     pub compacted: Position,
     /// A compaction is under way.
     pub compacting: bool,
-    /// Why the last compaction came to nothing.
+    /// Why the last compaction failed.
     pub compaction_failure: Option<CompactionFailure>,
-    /// Why nothing is being made durable for now. It goes on by itself.
+    /// Why no record becomes durable for now. The writer goes on by itself.
     pub stalled: Option<Arc<str>>,
-    /// Why the writer has stopped. What is not durable by then never is.
+    /// Why the writer has stopped. Records that are not durable by then never will be.
     pub fault: Option<Fault>,
 }
 
@@ -37,7 +37,7 @@ impl Durable {
         Durable { progress }
     }
 
-    /// How far it is.
+    /// The present progress.
     #[must_use]
     pub fn progress(&self) -> Progress {
         self.progress.borrow().clone()
@@ -46,7 +46,7 @@ impl Durable {
     /// Whether everything through this position is durable.
     ///
     /// # Errors
-    /// The fault, where it is not and never will be.
+    /// The fault, if the position is not durable and never will be.
     pub fn reached(&self, position: Position) -> Result<bool, Fault> {
         let progress = self.progress.borrow();
         match &progress.fault {
@@ -56,10 +56,10 @@ impl Durable {
         }
     }
 
-    /// Waits for the next change, and says how far it is then. Cancel-safe.
+    /// Waits for the next change; returns the new progress. Cancel-safe.
     ///
     /// # Errors
-    /// [`Fault::Closed`] when there is no writer any more.
+    /// [`Fault::Closed`] if the writer is gone.
     pub async fn changed(&mut self) -> Result<Progress, Fault> {
         self.progress.changed().await.map_err(|_| Fault::Closed)?;
         Ok(self.progress.borrow_and_update().clone())
@@ -68,7 +68,7 @@ impl Durable {
     /// Waits until everything through this position is durable. Cancel-safe.
     ///
     /// # Errors
-    /// The fault, where it never will be.
+    /// The fault, if the position never will be durable.
     pub async fn wait(&mut self, position: Position) -> Result<(), Fault> {
         let done = |progress: &Progress| progress.durable >= position || progress.fault.is_some();
         let ended = self.progress.wait_for(done).await.is_err();
@@ -81,10 +81,10 @@ impl Durable {
         }
     }
 
-    /// As [`Durable::wait`], for a thread of its own.
+    /// As [`Durable::wait`], blocking the calling thread.
     ///
     /// # Errors
-    /// The fault, where it never will be.
+    /// The fault, if the position never will be durable.
     pub fn wait_blocking(&mut self, position: Position) -> Result<(), Fault> {
         let waker = Waker::from(Arc::new(Unpark(thread::current())));
         let mut waiting = pin!(self.wait(position));

@@ -9,25 +9,25 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ReadError {
-    /// The system refused.
+    /// A call of the operating system failed.
     #[error("cannot {action} {place}")]
     Io {
-        /// What was tried.
+        /// The operation.
         action: &'static str,
-        /// On what.
+        /// The file or directory.
         place: String,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// Bytes that once were right no longer are.
+    /// Bytes that had been written correctly have changed.
     #[error(
         "{place} is damaged at byte {offset}: {what}; what follows it may have been acknowledged, so nothing is left out: restore \
          a backup to another place, and keep this one"
     )]
     Damaged {
-        /// In what.
+        /// The damaged file or key.
         place: String,
-        /// From which byte on.
+        /// The offset of the first damaged byte.
         offset: u64,
         /// What is wrong.
         what: String,
@@ -38,22 +38,22 @@ pub enum ReadError {
          made before it ran"
     )]
     Newer {
-        /// In what.
+        /// The file or key.
         place: String,
-        /// The version that it says.
+        /// The format version found.
         found: u32,
-        /// The newest that can be read.
+        /// The newest supported version.
         supported: u32,
     },
-    /// The service that keeps the log does not give it.
+    /// The service that keeps the log does not return it.
     #[error("cannot read from {place}: {what}")]
     Remote {
-        /// Which service.
+        /// The service.
         place: String,
-        /// What it said, or that it said nothing.
+        /// Its answer, or that there was none.
         what: String,
     },
-    /// A copy that was interrupted, or is still being made.
+    /// The log is a copy that was interrupted, or is still being made.
     #[error(
         "{place} holds a part of a copy: `ratn state copy` was interrupted there, or is still at work; if it is not, {}empty the place ({how}) \
          and copy again",
@@ -61,30 +61,30 @@ pub enum ReadError {
          where the source is not marked, " } else { "" }
     )]
     Unfinished {
-        /// In what.
+        /// The place of the copy.
         place: String,
-        /// All of it may be there.
+        /// The copy may be complete.
         complete: bool,
-        /// How it is emptied.
+        /// How to empty the place.
         how: String,
     },
-    /// All of it is somewhere else.
+    /// The log was moved to another place.
     #[error(
         "{place} was moved to {to} by `ratn state copy`, and has nothing of what was written since: use a config that names the other place; \
          to go back, stop what writes there and copy it back to an empty place; only if nothing was written there, take the mark away ({how})"
     )]
     Moved {
-        /// What.
+        /// The place of the log.
         place: String,
-        /// Where to.
+        /// Where it was moved to.
         to: String,
-        /// How the mark is taken away.
+        /// How to remove the mark.
         how: String,
     },
-    /// Something that belongs to the log is not there.
+    /// A part of the log is missing.
     #[error("{place}: {what}; the log is incomplete: put back what was removed, or restore a backup")]
     Incomplete {
-        /// Where.
+        /// The place.
         place: String,
         /// What is missing.
         what: String,
@@ -95,35 +95,35 @@ pub enum ReadError {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum OpenError {
-    /// A second writer.
+    /// Another writer has the place.
     #[error("{place} has a writer already ({holder}): stop it first, or choose another place")]
     Held {
-        /// Which log.
+        /// The log.
         place: String,
-        /// What is known of its writer.
+        /// What is known about its writer.
         holder: String,
     },
-    /// It cannot be read.
+    /// The log cannot be read.
     #[error(transparent)]
     Read(#[from] ReadError),
-    /// It cannot be made ready for writing.
+    /// The log cannot be prepared for writing.
     #[error("cannot {action} {place}")]
     Io {
-        /// What was tried.
+        /// The operation.
         action: &'static str,
-        /// On what.
+        /// The file or directory.
         place: String,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// The service that keeps the log has another one than before.
+    /// The service that keeps the log has another state than before.
     #[error(
         "{place} in etcd is older than what this host has seen of it, or of another cluster: an older state of etcd was put in place, and \
          what was acknowledged since then may be gone; see that no robot moves by it, then start one daemon with \
          `storage.accept_restored = {generation}`"
     )]
     Restored {
-        /// Which log.
+        /// The log.
         place: String,
         /// The generation that accepting it begins.
         generation: u64,
@@ -131,54 +131,54 @@ pub enum OpenError {
     /// The options contradict each other.
     #[error("{what}")]
     Options {
-        /// Which, and what they have to be.
+        /// The options, and the rule.
         what: String,
     },
 }
 
-/// Why a writer has stopped. It stays stopped: what is on the disk is certain again only after it has been read anew.
+/// Why a writer has stopped. It stays stopped: what is on disk is certain again only after it has been read anew.
 #[derive(Debug, Clone, Error)]
 #[non_exhaustive]
 pub enum Fault {
-    /// Writing failed. It is not tried again: after a failed sync nobody knows what the disk has.
+    /// Writing failed. It is not retried: after a failed sync the content of the disk is unknown.
     #[error("cannot {action} {place}, so nothing more is accepted: {}, then start again", advice(source))]
     Io {
-        /// What was tried.
+        /// The operation.
         action: &'static str,
-        /// On what.
+        /// The file.
         place: String,
-        /// What the system said.
+        /// The system's error.
         source: Arc<io::Error>,
     },
-    /// The service that keeps the log refuses.
+    /// The service that keeps the log refuses a call.
     #[error("cannot {action} {place}, so nothing more is accepted: {what}")]
     Remote {
-        /// What was tried.
+        /// The operation.
         action: &'static str,
-        /// On what.
+        /// The service.
         place: String,
-        /// What the service said.
+        /// The service's answer.
         what: String,
     },
-    /// Another writer has taken the place, past the lock; or a file of the log was removed or replaced.
+    /// Another writer has taken the place in spite of the lock, or a file of the log was removed or replaced.
     #[error(
         "another writer has taken {place}, or its files were removed or replaced, so nothing more is accepted from this one: see who \
          else uses it, and end one of them"
     )]
     Fenced {
-        /// Which log.
+        /// The log.
         place: String,
     },
-    /// Another process leads, as it may where several stand by for one log.
+    /// Another process leads, which is normal if several stand by for one log.
     #[error("another process leads {place} now, so nothing more is accepted from this one")]
     Deposed {
-        /// Which log.
+        /// The log.
         place: String,
     },
-    /// The thread that writes has ended by a defect.
+    /// The writing thread ended because of a defect.
     #[error("the thread that writes {place} has ended, so nothing more is accepted: start again, and report it")]
     Ended {
-        /// Which log.
+        /// The log.
         place: String,
     },
     /// The writer was closed.
@@ -187,7 +187,7 @@ pub enum Fault {
 }
 
 impl Fault {
-    /// Whether somebody else has the writer's place, or may have it.
+    /// Whether another writer has the place, or may have it.
     #[must_use]
     pub fn is_lost_place(&self) -> bool {
         matches!(self, Fault::Fenced { .. } | Fault::Deposed { .. })
@@ -198,23 +198,23 @@ impl Fault {
 #[derive(Debug, Clone, Error)]
 #[non_exhaustive]
 pub enum AppendError {
-    /// A record above the bound.
+    /// The record exceeds the size limit.
     #[error("a record of {bytes} bytes, and at most {most} are accepted")]
     TooLarge {
-        /// How large it is.
+        /// Its size in bytes.
         bytes: usize,
-        /// How large it may be.
+        /// The limit in bytes.
         most: usize,
     },
-    /// The disk does not keep up.
+    /// The disk is too slow: too many bytes wait.
     #[error("{buffered} bytes wait to be written, and at most {most} may: try again when some of them are durable")]
     Full {
-        /// How many wait.
+        /// Bytes that wait.
         buffered: usize,
-        /// How many may.
+        /// The limit in bytes.
         most: usize,
     },
-    /// Nothing is accepted any more.
+    /// The writer has stopped.
     #[error(transparent)]
     Stopped(#[from] Fault),
 }
@@ -223,52 +223,52 @@ pub enum AppendError {
 #[derive(Debug, Clone, Error)]
 #[non_exhaustive]
 pub enum CompactError {
-    /// One at a time.
+    /// Another compaction is under way.
     #[error("a compaction is under way")]
     Busy,
-    /// A snapshot of what was not appended.
+    /// The snapshot is for records that were not appended.
     #[error("a snapshot through {through}, and the last record is {last}")]
     Ahead {
-        /// What was asked for.
+        /// The position asked for.
         through: Position,
-        /// What there is.
+        /// The last position appended.
         last: Position,
     },
-    /// A snapshot older than the one that there is.
+    /// The snapshot is older than the present one.
     #[error("a snapshot through {through}, and there is one through {compacted}")]
     Behind {
-        /// What was asked for.
+        /// The position asked for.
         through: Position,
-        /// What there is.
+        /// The position of the present snapshot.
         compacted: Position,
     },
-    /// Nothing is accepted any more.
+    /// The writer has stopped.
     #[error(transparent)]
     Stopped(#[from] Fault),
 }
 
-/// Why a compaction that was begun came to nothing. Nothing is lost, and the log goes on; another may be tried.
+/// Why a compaction failed. Nothing is lost, and the log goes on; another compaction may be tried.
 #[derive(Debug, Clone, Error)]
 #[error("no snapshot through {through}: cannot {action} {place}")]
 pub struct CompactionFailure {
-    /// What the snapshot would have stood for.
+    /// The position through which the snapshot would have replaced records.
     pub through: Position,
-    /// What was tried.
+    /// The operation.
     pub action: &'static str,
-    /// On what.
+    /// The file or key.
     pub place: String,
-    /// What the system said.
+    /// The system's error.
     pub source: Arc<io::Error>,
 }
 
-/// Why there is no backup, or why it was not restored. What was begun has been removed.
+/// Why a backup could not be made, or restored. A partial copy has been removed.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum CopyError {
-    /// What would be copied is not a whole log.
+    /// The source is not a complete log.
     #[error(transparent)]
     Read(#[from] ReadError),
-    /// A place cannot be taken.
+    /// The writer's place of a log cannot be taken.
     #[error(transparent)]
     Open(#[from] OpenError),
     /// The copy cannot be written.
@@ -280,28 +280,28 @@ pub enum CopyError {
     /// There is no log to copy.
     #[error("there is no log in {place}")]
     Nothing {
-        /// Where one was looked for.
+        /// The place that was read.
         place: String,
     },
-    /// What was copied may have been written by another one meanwhile.
+    /// Another writer may have written to the source during the copy.
     #[error(
         "while it was copied the source was taken by another writer, or may have been: throw the copy away, and see who writes there"
     )]
     SourceLost(#[source] Fault),
-    /// Nothing is overwritten.
+    /// The target is not empty, and nothing is overwritten.
     #[error("{place} is not empty: nothing is overwritten, choose one that is empty or not there yet")]
     NotEmpty {
-        /// Where the copy was to go.
+        /// The target.
         place: String,
     },
-    /// The system refused.
+    /// A call of the operating system failed.
     #[error("cannot {action} {place}")]
     Io {
-        /// What was tried.
+        /// The operation.
         action: &'static str,
-        /// On what.
+        /// The file or directory.
         place: String,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
 }

@@ -1,10 +1,11 @@
-//! A durable log: append with group commit, snapshots, recovery. What daemons keep their state in.
+//! A durable log: append with group commit, snapshots, recovery. Daemons keep their state in it.
 //!
 //! ```text
 //!   append ──▶ buffer ──▶ one thread: write, sync, "durable through 4711", again ──▶ answers that waited for it leave
 //! ```
-//! [`Store`] and [`Writer`] are what is promised, wherever the log is: append, read, compact, one guarded writer. [`Log`] keeps it in
-//! files, [`Etcd`] in etcd, where several processes may stand by for its writer; [`transfer`] copies it from one to the other. Payloads are bytes; what they mean, and in which version, is their owner's.
+//! [`Store`] and [`Writer`] are the interface, wherever the log is kept: append, read, compact, one guarded writer. [`Log`] keeps it in
+//! files, [`Etcd`] in etcd, where several processes may stand by for its writer; [`transfer`] copies it from one to the other. Payloads are
+//! bytes; their meaning and version are up to their owner.
 //!
 //! ```
 //! use ratn_storage::{Log, Options, Store};
@@ -24,24 +25,26 @@
 //!
 //! # What is promised
 //!
-//! - **Acknowledged is on the disk.** [`Durable`] never shows a position that a loss of power could take away (with
-//!   [`Durability::None`] it does: nothing waits then). What is recovered is what was acknowledged, and perhaps records behind it.
-//! - **A torn end is cut, damage is refused.** Frames are synced one after the other, so a wrong one is a torn end only if no right
-//!   one follows it. Anything else may have been acknowledged: it is an error that names the file and the byte.
-//! - **After the first error of a write or a sync nothing is accepted any more**, and no sync is tried again: the system may have
-//!   thrown away what it could not write. Reading goes on. A new start reads what is there, writes the last segment anew and syncs it.
-//! - **One writer.** A second one is refused with who has the place. One that was got past, lock and all, acknowledges nothing more.
-//! - **Bounds**: a record, what waits to be written, a segment: [`Options`]. An append beyond them is refused and never waits.
-//! - A snapshot stands for the records before it, and is written beside appends. Formats have a version; an unknown newer
-//!   one is refused before anything is touched. [`backup()`] copies a running log, [`restore()`] overwrites nothing.
+//! - **Acknowledged means on disk.** [`Durable`] never shows a position that a loss of power could take away (with [`Durability::None`] it
+//!   does: nothing waits then). Recovery returns every acknowledged record, and perhaps records after them.
+//! - **A torn end is cut, damage is refused.** Frames are synced one after the other, so a wrong frame is a torn end only if no correct one
+//!   follows it. Any other wrong frame may have been acknowledged: it is an error that names the file and the byte.
+//! - **After the first error of a write or a sync nothing is accepted any more**, and no sync is retried: the system may have dropped the
+//!   data that it could not write. Reading goes on. A new start reads the log, rewrites the last segment and syncs it.
+//! - **One writer.** A second one is refused with the name of the holder. A writer that was superseded in spite of the lock acknowledges
+//!   nothing more.
+//! - **Limits** for a record, for the bytes that wait to be written, and for a segment: [`Options`]. An append beyond a limit is refused
+//!   and never waits.
+//! - A snapshot replaces the records before it, and is written concurrently with appends. Formats have a version; an unknown newer one is
+//!   refused before anything is changed. [`backup()`] copies a running log, [`restore()`] overwrites nothing.
 //!
 //! # Why a log and not a store
 //!
-//! Daemons keep their state in memory and only need it back after a restart: no query goes to the disk. Stores bring a tree, its
-//! compactions and its transactions for that, and the commit of a single writer costs up to twice the sync that it waits for: on a
-//! machine whose plain append and fdatasync takes 60 to 83 µs, three small puts took durably (p50) with fjall 44 µs, rusqlite
-//! (WAL) 64, heed 151, redb 166. What decides is the group commit, with one actor for many callers: which answers may leave now
-//! has to be known without a thread for each. That, and faults that can be injected one by one, is this much code.
+//! Daemons keep their state in memory and only need it back after a restart: no query goes to the disk. A store brings a tree, its
+//! compactions and its transactions for that, and the commit of a single writer costs up to twice the sync that it waits for: on a machine
+//! whose plain append and fdatasync takes 60 to 83 µs, three small puts took durably (p50) with fjall 44 µs, rusqlite (WAL) 64, heed 151,
+//! redb 166. The group commit decides, with one actor for many callers: the actor has to know, without a thread for each caller, which
+//! answers may leave now. That, and faults that tests can inject one by one, is about as much code as this crate.
 //!
 //! # What it costs
 //!

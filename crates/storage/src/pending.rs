@@ -1,10 +1,10 @@
-//! State that a writer shares with the writing thread and a compaction: the records that wait, and the position of each.
+//! State that a writer shares with the writing thread and a compaction: the records that wait, and their positions.
 //!
 //! ```text
-//!   append ──▶ batch ──take──▶ the thread that writes ──▶ progress.durable ──▶ whoever holds answers back
+//!   append ──▶ batch ──take──▶ the writing thread ──▶ progress.durable ──▶ callers that hold answers back
 //! ```
-//! The lock is held for copying a record and for swapping two buffers, never while something is written. In a batch every record is
-//! behind its length: `length u32 | payload`, little-endian.
+//! The lock is held for copying a record and for swapping two buffers, never during a write. In a batch every record follows its length:
+//! `length u32 | payload`, little-endian.
 
 use crate::durable::Progress;
 use crate::error::{AppendError, CompactError, Fault};
@@ -13,16 +13,16 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use tokio::sync::watch;
 
-/// A buffer that was larger gives the rest back.
+/// A larger buffer is shrunk to this size after use.
 const KEEP_BYTES: usize = 1 << 20;
 
-/// Before each payload.
+/// Size of the length before each payload.
 pub(crate) const RECORD_HEADER: usize = 4;
 
 /// Records that are written together.
 #[derive(Debug)]
 pub(crate) struct Batch {
-    /// Room for a header, to be filled in by who writes them; then the records.
+    /// Room for a header, which the writing thread fills in; then the records.
     pub(crate) bytes: Vec<u8>,
     pub(crate) first: Position,
     pub(crate) count: u32,
@@ -31,10 +31,10 @@ pub(crate) struct Batch {
 
 #[derive(Debug)]
 pub(crate) struct Pending {
-    /// Which log it is, for messages.
+    /// The log's place, for messages.
     pub(crate) place: String,
     state: Mutex<State>,
-    /// The thread that writes waits for it.
+    /// The writing thread waits for this.
     work: Condvar,
     progress: watch::Sender<Progress>,
 }
@@ -45,10 +45,10 @@ struct State {
     /// The other buffer, while it is not being written.
     spare: Option<Batch>,
     next: Position,
-    /// The thread that writes waits: it has to be woken.
+    /// The writing thread waits and has to be woken.
     idle: bool,
     closing: bool,
-    /// A compaction has begun: what the next batch is written to is new, so that what was written before can be removed.
+    /// A compaction has begun: the next batch goes to a new segment, so that the earlier ones can be removed.
     rotate: bool,
     fault: Option<Fault>,
 }
@@ -70,7 +70,7 @@ impl Batch {
 }
 
 impl Pending {
-    /// Nothing waits yet. `header`: the room that a batch has in front.
+    /// Without records. `header`: size of the room for a header in a batch.
     pub(crate) fn new(place: String, header: usize, last: Position, compacted: Position) -> Pending {
         let state = State {
             batch: Batch::new(header),
@@ -89,7 +89,7 @@ impl Pending {
         self.progress.subscribe()
     }
 
-    /// `at_once`: it counts as durable now.
+    /// Appends a record. `at_once`: it counts as durable now.
     pub(crate) fn append(&self, record: &[u8], most: usize, at_once: bool) -> Result<Position, AppendError> {
         let mut state = self.lock();
         if let Some(fault) = &state.fault {
@@ -105,20 +105,20 @@ impl Pending {
         if batch.count == 0 {
             batch.first = position;
         }
-        // Checked against a bound below 4 GiB.
+        // The length was checked against a limit below 4 GiB.
         let length = u32::try_from(record.len()).unwrap_or(u32::MAX);
         batch.bytes.extend_from_slice(&length.to_le_bytes());
         batch.bytes.extend_from_slice(record);
         batch.count += 1;
         let before = buffered..batch.bytes.len();
-        // Idle: there was nothing. Lingering: now there is enough.
+        // An idle thread had nothing to write; a lingering one has enough now.
         let wake = std::mem::take(&mut state.idle) || (at_once && before.contains(&KEEP_BYTES));
         drop(state);
         if wake {
             self.work.notify_one();
         }
         if at_once {
-            // Who asks finds it so; nobody has to be woken to hear it.
+            // Callers that check see this; no waiting caller has to be woken.
             self.progress.send_if_modified(|progress| {
                 progress.durable = position;
                 false
@@ -127,19 +127,19 @@ impl Pending {
         Ok(position)
     }
 
-    /// The last position that was given out.
+    /// The last position that was assigned.
     pub(crate) fn appended(&self) -> Position {
         Position(self.lock().next.0 - 1)
     }
 
-    /// Bytes that are not being written yet.
+    /// Number of bytes that are not being written yet.
     pub(crate) fn waiting_bytes(&self) -> usize {
         let state = self.lock();
         if state.batch.count == 0 { 0 } else { state.batch.bytes.len() }
     }
 
-    /// For the thread that writes: waits for records, then for more of them for as long as `linger` says, and says whether a compaction has begun since
-    /// the last batch. Nothing when all are written and the writer is closing.
+    /// For the writing thread: waits for records, then for more of them during `linger`; returns them, and whether a compaction has begun
+    /// since the last batch. `None` when all are written and the writer is closing.
     pub(crate) fn take(&self, linger: Duration) -> Option<(Batch, bool)> {
         let mut state = self.lock();
         while state.batch.count == 0 {
@@ -160,7 +160,7 @@ impl Pending {
         Some((batch, std::mem::take(&mut state.rotate)))
     }
 
-    /// For the thread that writes: all through this position are on the disk.
+    /// For the writing thread: all records through this position are on disk.
     pub(crate) fn synced(&self, through: Position) {
         self.progress.send_if_modified(|progress| {
             let further = through > progress.durable;
@@ -169,13 +169,13 @@ impl Pending {
         });
     }
 
-    /// For the thread that writes: it has written a batch.
+    /// For the writing thread: returns the buffer of a written batch.
     pub(crate) fn give_back(&self, mut batch: Batch) {
         batch.clear();
         self.lock().spare = Some(batch);
     }
 
-    /// Nothing is accepted any more. The first fault stays.
+    /// Accepts nothing any more. The first fault is kept.
     pub(crate) fn stop(&self, fault: &Fault) {
         let mut state = self.lock();
         if state.fault.is_some() {
@@ -187,7 +187,7 @@ impl Pending {
         self.progress.send_modify(|progress| progress.fault = Some(fault.clone()));
     }
 
-    /// Why nothing is being made durable for now, or that it is again.
+    /// Sets why nothing becomes durable for now; `None` when it does again.
     pub(crate) fn stalled(&self, why: Option<String>) {
         self.progress.send_if_modified(|progress| {
             let changed = progress.stalled.as_deref() != why.as_deref();
@@ -211,7 +211,7 @@ impl Pending {
         self.lock().closing
     }
 
-    /// Books a compaction.
+    /// Reserves the right to compact.
     pub(crate) fn begin_compaction(&self, through: Position) -> Result<(), CompactError> {
         let mut state = self.lock();
         if let Some(fault) = &state.fault {

@@ -1,25 +1,24 @@
-//! A log from one place to another, whatever each is kept in: from files to etcd and back.
+//! Copies a log from one place to another, whatever keeps each of them: from files to etcd and back.
 
 use crate::error::{CompactError, CopyError, OpenError, ReadError};
 use crate::store::{Position, Recovered, Store, Writer};
 
-/// What stands in place of the records of a snapshot: the position that the snapshot stands for. Nobody reads it.
+/// The record that replaces the records of a snapshot, at the position of the snapshot. It is never read.
 const PLACEHOLDER: &[u8] = b"";
 
-/// Copies a log into one that is empty. Its records get positions of their own; what they say is the same. The source's place is taken
-/// meanwhile, so that nothing is written there that the copy lacks. Holds the whole log in memory. Blocks.
+/// Copies a log into an empty one. Its records get new positions; their payloads are the same. The source's place is held meanwhile, so
+/// that nothing is written there that the copy lacks. Holds the whole log in memory. Blocks.
 ///
-/// The target's place is held until the end. The target is marked as unfinished first, and the mark is removed last: of a copy that was
-/// interrupted nobody opens the part that is there.
-/// Before that the source is marked as moved ([`Writer::mark_moved`](crate::Writer::mark_moved)), so that nobody goes on with it: there are never two that can be opened.
-/// Interrupted between the two, the same copy again finishes it.
+/// The target's place is held until the end. The target is marked as unfinished first, and that mark is removed last: a partial copy cannot
+/// be opened. Before that the source is marked as moved ([`Writer::mark_moved`](crate::Writer::mark_moved)), so that it cannot be
+/// continued: there are never two logs that can be opened. If the copy is interrupted between the two marks, repeating it finishes it.
 ///
 /// # Errors
-/// Where either has a writer, the source cannot be read, the target is not empty, or writing fails: then throw the target away.
+/// Either log has a writer, the source cannot be read, the target is not empty, or writing fails: then discard the target.
 pub fn transfer(from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError> {
     let (recovered, mut held) = match from.open() {
         Err(OpenError::Read(ReadError::Moved { place, to: moved, how })) => {
-            // Interrupted between the two marks: all of it is there, and the source is no one's any more.
+            // Interrupted between the two marks: the copy is complete, and the source is marked as moved.
             let finished = to.finish_copy(&moved)?;
             return finished.ok_or(CopyError::Read(ReadError::Moved { place, to: moved, how }));
         }
@@ -28,7 +27,7 @@ pub fn transfer(from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError>
     let (last, mut copy) = put(recovered, from, to)?;
     let draw = crate::draw::number();
     let draw = draw.map_err(|source| CopyError::Io { action: "draw a number for", place: to.place(), source })?;
-    // By the number it is known which copy the source was moved to.
+    // The number tells to which copy the source was moved.
     let moved = format!("{} (copy {draw:016x})", to.place());
     copy.mark_complete(&moved)?;
     held.mark_moved(&moved)?;
@@ -36,7 +35,7 @@ pub fn transfer(from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError>
     Ok(last)
 }
 
-/// As [`transfer`], of a log that may be written meanwhile: the copy is what it was at one moment. For backups.
+/// As [`transfer`], for a log that may be written meanwhile: the copy has the state of one moment. For backups.
 ///
 /// # Errors
 /// As [`transfer`].
@@ -46,7 +45,7 @@ pub fn transfer_running(from: &dyn Store, to: &dyn Store) -> Result<Position, Co
     Ok(last)
 }
 
-/// All of it, still marked as unfinished.
+/// Copies everything; the target is still marked as unfinished.
 fn put(recovered: Recovered, from: &dyn Store, to: &dyn Store) -> Result<(Position, Box<dyn Writer>), CopyError> {
     if recovered.last() == Position(0) {
         return Err(CopyError::Nothing { place: from.place() });
@@ -66,7 +65,7 @@ fn put(recovered: Recovered, from: &dyn Store, to: &dyn Store) -> Result<(Positi
             CompactError::Stopped(fault) => CopyError::Write(fault.into()),
             other => CopyError::Snapshot(other.to_string()),
         })?;
-        // The snapshot counts before anything is put behind it.
+        // The snapshot has to count before anything is appended after it.
         while durable.progress().compacting {
             std::thread::sleep(std::time::Duration::from_millis(1));
         }
@@ -76,7 +75,7 @@ fn put(recovered: Recovered, from: &dyn Store, to: &dyn Store) -> Result<(Positi
     }
     for record in &recovered.records {
         last = writer.append(&record.payload)?;
-        // One at a time: what waits is bounded.
+        // One record at a time, because the waiting bytes are bounded.
         durable.wait_blocking(last)?;
     }
     Ok((last, writer))

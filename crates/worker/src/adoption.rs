@@ -1,8 +1,8 @@
-//! A worker that outlives its process manager for a while, so that a successor can take it over.
+//! Adoption: a worker outlives its process manager for a while, so that a successor can take the worker over.
 //!
 //! ```text
-//!   parent's pipe ends ─▶ waits on its socket ── somebody connects in time ──▶ that connection is the parent's pipe now
-//!                              └── nobody does ──▶ ends
+//!   parent's pipe ends ─▶ waits on its socket ── a successor connects in time ──▶ that connection replaces the parent's pipe
+//!                              └── none does ──▶ ends
 //! ```
 //! The process manager sets [`SOCKET_VARIABLE`] and [`GRACE_VARIABLE`] for workers of a template that says `adopt = true`; without them a
 //! worker ends with its parent.
@@ -14,15 +14,15 @@ use std::time::{Duration, Instant};
 
 /// The environment variable with the path of the socket that a worker listens on for a successor of its process manager.
 pub const SOCKET_VARIABLE: &str = "RATN_ADOPT_SOCKET";
-/// The environment variable with how long it waits for one, in seconds.
+/// The environment variable with how long the worker waits for a successor, in seconds.
 pub const GRACE_VARIABLE: &str = "RATN_ADOPT_GRACE_S";
 
-/// The pause between two looks for a successor.
+/// Interval between two checks for a successor.
 const LOOK_INTERVAL: Duration = Duration::from_millis(10);
-/// No grace is longer.
+/// Maximum grace.
 const LONGEST_GRACE_S: f64 = 86_400.0;
 
-/// Where a successor is waited for.
+/// The socket on which a worker waits for a successor.
 #[derive(Debug)]
 pub(crate) struct Adoption {
     listener: UnixListener,
@@ -30,10 +30,10 @@ pub(crate) struct Adoption {
 }
 
 impl Adoption {
-    /// As the environment says; nothing where it does not.
+    /// The adoption that the environment variables describe; `None` without them.
     ///
     /// # Errors
-    /// Where the socket cannot be made, or the grace is no number of seconds.
+    /// The socket cannot be made, or the grace is not a number of seconds.
     pub(crate) fn from_environment() -> io::Result<Option<Adoption>> {
         let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty());
         let (Some(socket), Some(grace)) = (variable(SOCKET_VARIABLE), variable(GRACE_VARIABLE)) else {
@@ -60,7 +60,7 @@ impl Adoption {
         Ok(Adoption { listener, grace })
     }
 
-    /// The connection of a successor that comes in time.
+    /// Waits for a successor's connection; `None` if none comes within the grace.
     pub(crate) fn successor(&self) -> Option<UnixStream> {
         let until = Instant::now() + self.grace;
         loop {

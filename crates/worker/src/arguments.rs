@@ -20,9 +20,9 @@ use crate::worker::{Worker, WorkerOptions};
 use std::collections::BTreeMap;
 use std::str::FromStr;
 
-/// Options that stand without a value.
+/// Options without a value.
 const FLAGS: [&str; 2] = ["--exit-with-parent", "--insecure"];
-/// The others of every worker.
+/// The other options, which every worker has.
 const OPTIONS: [&str; 7] =
     ["--id", "--endpoint-file", "--listen", "--kind", "--host", "--resource-manager", "--config"];
 
@@ -40,21 +40,21 @@ pub enum ArgumentError {
     /// An option without its value.
     #[error("{option} needs a value")]
     NoValue {
-        /// Which.
+        /// The option.
         option: String,
     },
     /// An option was given twice.
     #[error("{option} is given twice")]
     Twice {
-        /// Which.
+        /// The option.
         option: String,
     },
     /// The value of an option cannot be read.
     #[error("{option} is `{value}`: {why}")]
     Value {
-        /// Which.
+        /// The option.
         option: String,
-        /// As it was given.
+        /// The value as given.
         value: String,
         /// What is wrong with it.
         why: String,
@@ -62,7 +62,7 @@ pub enum ArgumentError {
     /// The worker has no such option.
     #[error("there is no option `{option}`; there are {known}")]
     Unknown {
-        /// As it was given.
+        /// The option as given.
         option: String,
         /// The options that it has.
         known: String,
@@ -102,14 +102,14 @@ impl Arguments {
                 _ => (argument, None),
             };
             let value = match value {
-                // `--insecure=false` must not read as `--insecure`.
+                // `--insecure=false` must not be read as `--insecure`.
                 Some(value) if FLAGS.contains(&option.as_str()) => {
                     let why = "it stands without a value: leave it out, or give it alone".to_owned();
                     return Err(ArgumentError::Value { option, value, why });
                 }
                 Some(value) => value,
                 None if FLAGS.contains(&option.as_str()) => String::new(),
-                // What begins like an option is told as one that is not known, not as a lack of its value.
+                // An argument that looks like an option is reported as unknown, not as a missing value.
                 None if !option.starts_with("--") => return Err(unknown(&option, &[])),
                 None => arguments.next().ok_or_else(|| ArgumentError::NoValue { option: option.clone() })?,
             };
@@ -120,10 +120,10 @@ impl Arguments {
         Ok(Arguments { given, pooled, known: Vec::new() })
     }
 
-    /// Takes out an option of the worker's own, for example `--speed`: its value, or `None` where it was not given.
+    /// Takes out an option of the worker's own, for example `--speed`. Returns its value, or `None` if it was not given.
     ///
     /// # Errors
-    /// [`ArgumentError::Value`] where the value cannot be read as a `T`.
+    /// [`ArgumentError::Value`] if the value cannot be read as a `T`.
     pub fn take<T: FromStr>(&mut self, option: &str) -> Result<Option<T>, ArgumentError>
     where
         T::Err: std::fmt::Display,
@@ -141,7 +141,7 @@ impl Arguments {
     /// A worker with these options, without actions.
     ///
     /// # Errors
-    /// [`ArgumentError`], also for an argument that nobody has taken.
+    /// [`ArgumentError`], also for an argument that neither [`Arguments::take`] nor the table above knows.
     pub fn worker(self) -> Result<Worker, ArgumentError> {
         Ok(Worker::new(self.options()?))
     }

@@ -1,11 +1,11 @@
-//! The audit log: one event of the tracing target `audit` per mutation of a server, with who, what, how it ended and which trace it was
-//! a part of. Off unless somebody listens to the target (a daemon's `audit_file`, a filter with `audit=info`): then it costs a comparison.
+//! The audit log: one event of the tracing target `audit` per mutation of a server, with caller, mutation, outcome and trace. Off unless a
+//! subscriber listens to the target (a daemon's `audit_file`, a filter with `audit=info`): then it costs a comparison.
 //!
 //! ```text
 //!   begin(caller, request, || Mutation) ─▶ Pending ─ ended(outcome) ─▶ a record
 //!                                             └─ dropped: the caller left before the answer ─▶ a record with CANCELLED
 //! ```
-//! What is changed is a [`Mutation`], a type of its own per kind; what makes text of it is here and nowhere else.
+//! Each kind of change is a variant of [`Mutation`]; only this module turns it into text.
 
 use crate::access::Caller;
 use crate::trace;
@@ -15,10 +15,10 @@ use tonic::{Code, Status};
 
 /// The tracing target.
 pub const TARGET: &str = "audit";
-/// Longer texts of callers are cut, in characters.
+/// Maximum length of a text from a caller, in characters; a longer one is truncated.
 const LONGEST: usize = 1_000;
 
-/// What is changed. Its name in the log is that of the variant, `emergency_stop`.
+/// A change of a server's state. Its name in the log is the variant's name in snake case: `emergency_stop`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "operation", rename_all = "snake_case")]
 #[expect(missing_docs, reason = "the fields are those of the requests of the same name in the proto")]
@@ -63,7 +63,7 @@ pub enum Mutation {
     PutBack,
 }
 
-/// A mutation under way. Dropped without an end, it says that its caller left.
+/// A mutation under way. If it is dropped before [`Pending::ended`], the record says that the caller left.
 #[derive(Debug)]
 pub struct Pending(Option<Box<Record>>);
 
@@ -74,24 +74,24 @@ struct Record {
     mutation: Mutation,
 }
 
-/// Whether anybody writes it down.
+/// Whether any subscriber records audit events.
 pub fn enabled() -> bool {
     tracing::enabled!(target: TARGET, tracing::Level::INFO)
 }
 
-/// A mutation begins, by a request that may have an id.
+/// Begins a mutation; the request id may be empty.
 pub fn begin(caller: &Caller, request: &str, mutation: impl FnOnce() -> Mutation) -> Pending {
     let record = || Record { who: caller.clone(), request: cut(request), mutation: mutation() };
     Pending(enabled().then(|| Box::new(record())))
 }
 
 impl Pending {
-    /// How it ended.
+    /// Records how the mutation ended.
     pub fn ended<T>(self, outcome: &Result<T, Status>) {
         self.ended_with(outcome, |_| None);
     }
 
-    /// The same, with the fencing token of what came of it.
+    /// As [`Pending::ended`], with the fencing token of the result.
     pub fn ended_with<T>(mut self, outcome: &Result<T, Status>, token: impl FnOnce(&T) -> Option<FencingToken>) {
         let Some(record) = self.0.take() else { return };
         match outcome {
@@ -120,7 +120,7 @@ impl Record {
     }
 }
 
-/// A text of a caller's, not without end.
+/// A caller's text, truncated to the maximum length.
 pub fn cut(text: &str) -> String {
     text.chars().take(LONGEST).collect()
 }

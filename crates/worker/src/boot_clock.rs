@@ -1,11 +1,11 @@
-//! Time since the machine was booted, the time included in which it was suspended (`CLOCK_BOOTTIME`). `Instant` (`CLOCK_MONOTONIC`) stands still
-//! meanwhile, so that a host that wakes up would go on believing what has long ended elsewhere.
+//! A clock that counts the time since boot, including the time during which the machine was suspended (`CLOCK_BOOTTIME`). `Instant`
+//! (`CLOCK_MONOTONIC`) does not count that time, so a host that wakes up would still believe what has long ended elsewhere.
 //!
-//! Beliefs that somebody else may act against are measured by it: that a session lives, that a lease is held, that a state is still this
-//! process's own. Pauses, retries and deadlines of calls are measured with `Instant`. A timer does not run while the machine is suspended
+//! This clock measures every belief that another process may act against: that a session lives, that a lease is held, that this process
+//! still owns a state. Pauses, retries and deadlines of calls are measured with `Instant`. Timers do not run while the machine is suspended
 //! either, so a belief is checked where it is used, and [`BootClock::sleep_until`] looks at the clock every [`LOOK_INTERVAL`].
 //!
-//! A virtual machine that is paused or restored from a snapshot by its host does not see that in any clock of its own.
+//! A virtual machine that its host pauses, or restores from a snapshot, cannot see that in any clock of its own.
 
 use nix::time::{ClockId, clock_gettime};
 use std::ops::Add;
@@ -13,13 +13,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-/// How long after the machine has woken up a sleeper notices at the latest.
+/// Maximum delay until a sleeper notices that the machine has woken up.
 pub const LOOK_INTERVAL: Duration = Duration::from_millis(100);
 
 /// A clock that goes on while the machine is suspended. Clones are the same clock.
 #[derive(Debug, Clone, Default)]
 pub struct BootClock {
-    /// Nanoseconds of suspensions that a test has made up.
+    /// Nanoseconds of suspension that a test has simulated.
     suspended: Option<Arc<AtomicU64>>,
 }
 
@@ -28,13 +28,13 @@ pub struct BootClock {
 pub struct BootInstant(Duration);
 
 impl BootClock {
-    /// For tests: a clock that can be told that the machine was suspended.
+    /// For tests: a clock whose suspension can be simulated.
     pub fn suspendable() -> BootClock {
         BootClock { suspended: Some(Arc::default()) }
     }
 
-    /// For tests: the machine was suspended for so long, and wakes up now. Does nothing to a clock that is not
-    /// [`BootClock::suspendable`].
+    /// For tests: simulates that the machine was suspended for `duration` and wakes up now. Only for a clock made by
+    /// [`BootClock::suspendable`]; does nothing to any other.
     pub fn suspend(&self, duration: Duration) {
         if let Some(suspended) = &self.suspended {
             suspended.fetch_add(u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX), Ordering::SeqCst);
@@ -44,7 +44,7 @@ impl BootClock {
     /// Now.
     ///
     /// # Panics
-    /// Where the system has no such clock: Linux has had it since 2.6.39.
+    /// If the system has no such clock: Linux has had it since 2.6.39.
     #[expect(clippy::expect_used, reason = "without this clock nothing may be believed, and Linux always has it")]
     pub fn now(&self) -> BootInstant {
         let now = Duration::from(clock_gettime(ClockId::CLOCK_BOOTTIME).expect("CLOCK_BOOTTIME can be read"));
@@ -52,7 +52,7 @@ impl BootClock {
         BootInstant(now + Duration::from_nanos(suspended))
     }
 
-    /// Returns when it is `at`, or, where the machine was suspended then, at most [`LOOK_INTERVAL`] after it has woken up.
+    /// Returns at `at`; if the machine was suspended then, at most [`LOOK_INTERVAL`] after it has woken up.
     pub async fn sleep_until(&self, at: BootInstant) {
         loop {
             let left = at.saturating_duration_since(self.now());
@@ -65,13 +65,13 @@ impl BootClock {
 }
 
 impl BootInstant {
-    /// How long after `earlier` this is; zero where it is before.
+    /// Duration since `earlier`; zero if this instant is before it.
     #[must_use]
     pub fn saturating_duration_since(self, earlier: BootInstant) -> Duration {
         self.0.saturating_sub(earlier.0)
     }
 
-    /// So much earlier, and no earlier than the boot.
+    /// This instant minus `duration`, but no earlier than the boot.
     #[must_use]
     pub fn saturating_sub(self, duration: Duration) -> BootInstant {
         BootInstant(self.0.saturating_sub(duration))

@@ -1,5 +1,5 @@
-//! The address of a server: TCP, with or without TLS, or a Unix socket. It is written `http://host:port`, `host:port`, `https://host:port` or
-//! `unix:/path`. Several addresses, separated by commas, are servers of which one leads and the others stand by.
+//! The address of a server: TCP, with or without TLS, or a Unix socket. It is written `http://host:port`, `host:port`, `https://host:port`
+//! or `unix:/path`. Several addresses, separated by commas, name servers of which one leads and the others stand by.
 
 use crate::leader::LeaderConnector;
 use crate::tls::ClientTls;
@@ -17,9 +17,9 @@ use std::time::Duration;
 
 /// A connection attempt that takes longer has failed.
 pub const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
-/// A connection is probed this often, idle or not: by pings of both sides, or by the system (`Watched`) …
+/// Interval of keep-alive probes on a connection, idle or not: pings of both sides, or probes of the system (`Watched`).
 pub const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(5);
-/// … and given up when a probe stays unanswered for this long.
+/// A connection is given up if a probe stays unanswered for this long.
 pub const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// A socket path has to fit into `sockaddr_un`, with its final zero.
@@ -34,21 +34,21 @@ const LOCAL: &str = "local";
 pub enum Endpoint {
     /// Over TCP.
     Tcp {
-        /// A name or an address, an IPv6 one without its brackets.
+        /// A host name or an address; an IPv6 address without its brackets.
         host: String,
-        /// The port; 0 lets the system choose, for listening only.
+        /// The port; 0 lets the system choose one, for listening only.
         port: u16,
     },
-    /// Over TCP with TLS; both as above.
+    /// Over TCP with TLS; the fields as above.
     Tls {
-        /// The host name, for which the server's certificate is made out.
+        /// The host name that the server's certificate must contain.
         host: String,
         /// The port.
         port: u16,
     },
-    /// At a path of the file system.
+    /// A Unix socket at this path.
     Unix(PathBuf),
-    /// The one of these servers that leads; the others stand by. For connecting only.
+    /// Whichever of these servers leads; the others stand by. For connecting only.
     AnyOf(Vec<Endpoint>),
 }
 
@@ -68,9 +68,9 @@ pub struct EndpointError {
 #[derive(Debug, thiserror::Error)]
 #[error("cannot connect to {endpoint}")]
 pub struct ConnectError {
-    /// Which.
+    /// The server's endpoint.
     pub endpoint: Endpoint,
-    /// Why.
+    /// The cause.
     #[source]
     pub source: tonic::transport::Error,
 }
@@ -85,17 +85,17 @@ impl ConnectError {
 }
 
 impl Endpoint {
-    /// A port of this machine's loopback that the system chooses.
+    /// A port on the loopback interface that the system chooses.
     pub fn loopback() -> Endpoint {
         Endpoint::Tcp { host: "127.0.0.1".to_owned(), port: 0 }
     }
 
-    /// For listening: a socket in the runtime directory, named as its server. Written `local`.
+    /// For listening: a socket in the runtime directory with the server's name. Written `local`.
     pub fn local() -> Endpoint {
         Endpoint::Unix(PathBuf::new())
     }
 
-    /// The addresses of the single servers; the endpoint itself where it is one.
+    /// The addresses of the single servers; for a single server, the endpoint itself.
     pub fn members(&self) -> &[Endpoint] {
         match self {
             Endpoint::AnyOf(members) => members,
@@ -183,11 +183,11 @@ impl TryFrom<String> for Endpoint {
     }
 }
 
-/// A channel that connects with its first call, and again whenever the connection broke; with TLS as `tls` says at that time. Needs a tokio
-/// runtime.
+/// A channel that connects at its first call, and again whenever the connection broke; with the TLS settings that `tls` has at that time.
+/// Needs a tokio runtime.
 ///
 /// # Errors
-/// [`ConnectError`] when the endpoint makes no URI.
+/// [`ConnectError`] if the endpoint makes no URI.
 pub fn connect_lazily(endpoint: &Endpoint, tls: &ClientTls) -> Result<Traced, ConnectError> {
     connect_lazily_as(endpoint, tls, Watched::ByPings)
 }
@@ -213,15 +213,15 @@ pub(crate) fn connect_lazily_as(
 /// How a client notices that the other side of a quiet connection is gone.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Watched {
-    /// By pings of HTTP/2: what does not answer is suspended or gone. For the daemons of a system.
+    /// By HTTP/2 pings: a process that does not answer is suspended or gone. For the daemons of a system.
     ByPings,
-    /// By the system's own probes of a TCP connection (keep-alive, and a bound for what is not acknowledged): its host is gone. For providers,
-    /// whose processes are watched over by leases and health. Servers of other gRPC libraries close a connection with GOAWAY
-    /// (`too_many_pings`) after the third ping within five minutes without data, and nothing tells them not to.
+    /// By the system's own TCP probes (keep-alive, and a limit for unacknowledged data), which detect that the host is gone. For providers,
+    /// whose processes are monitored by leases and health checks. Servers of other gRPC libraries close a connection with GOAWAY
+    /// (`too_many_pings`) after the third ping within five minutes without data, and no setting of the client prevents that.
     BySystem,
 }
 
-/// Connects over TCP; the system notices when the other host is gone.
+/// A connector for TCP; the system detects when the other host is gone.
 pub(crate) fn over_tcp() -> HttpConnector {
     let mut tcp = HttpConnector::new();
     tcp.enforce_http(false);
@@ -229,7 +229,7 @@ pub(crate) fn over_tcp() -> HttpConnector {
     tcp.set_connect_timeout(Some(CONNECT_TIMEOUT));
     tcp.set_keepalive(Some(KEEPALIVE_INTERVAL));
     tcp.set_keepalive_interval(Some(KEEPALIVE_INTERVAL));
-    // It bounds unanswered probes and data that is not acknowledged alike.
+    // This limit applies to unanswered probes and to unacknowledged data.
     tcp.set_tcp_user_timeout(Some(KEEPALIVE_INTERVAL + KEEPALIVE_TIMEOUT));
     tcp
 }
@@ -237,12 +237,12 @@ pub(crate) fn over_tcp() -> HttpConnector {
 /// A channel that is connected, as [`connect_lazily`].
 ///
 /// # Errors
-/// [`ConnectError`] when nobody answers there within [`CONNECT_TIMEOUT`].
+/// [`ConnectError`] if no server answers within [`CONNECT_TIMEOUT`].
 pub async fn connect(endpoint: &Endpoint, tls: &ClientTls) -> Result<Traced, ConnectError> {
     connected(endpoint, tls, configured(endpoint)?).await
 }
 
-/// As [`connect`], without pings while nothing is asked: for questions that are asked again and again, each with a deadline.
+/// As [`connect`], without pings while no call is under way: for calls that are repeated at short intervals, each with a deadline.
 ///
 /// # Errors
 /// As [`connect`].
@@ -264,14 +264,14 @@ async fn connected(
     connected.map(Traced::new).map_err(|source| ConnectError { endpoint: endpoint.clone(), source })
 }
 
-/// What tonic does not do by itself.
+/// Connectors for what tonic does not do by itself.
 enum By {
-    /// TLS: tonic's own would be as it was when the channel was made.
+    /// TLS: tonic's own connector would keep the settings of the time when the channel was made.
     Tls(Connector),
     Leader(LeaderConnector),
-    /// Tonic's own does not bound what is not acknowledged.
+    /// TCP: tonic's own connector sets no limit for unacknowledged data.
     Tcp(HttpConnector),
-    /// Tonic's own is woken by everything that the other side reads.
+    /// Unix sockets: tonic's own connector is woken whenever the other side reads.
     Unix(UnixConnector),
 }
 
@@ -301,12 +301,12 @@ fn unwatched(endpoint: &Endpoint) -> Result<tonic::transport::Endpoint, ConnectE
     Ok(configured.connect_timeout(CONNECT_TIMEOUT))
 }
 
-/// As tonic takes it: of TLS it knows nothing.
+/// The address in the form for tonic, which does not know of TLS here.
 fn address_of(endpoint: &Endpoint) -> String {
     match endpoint {
         Endpoint::Tls { host, port } => Endpoint::Tcp { host: host.clone(), port: *port }.to_string(),
         Endpoint::Tcp { .. } | Endpoint::Unix(_) => endpoint.to_string(),
-        // Only for the name of the server in requests: the connector knows where they go.
+        // Only for the server's name in requests: the connector knows the real addresses.
         Endpoint::AnyOf(members) => members.first().map(address_of).unwrap_or_default(),
     }
 }

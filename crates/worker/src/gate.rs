@@ -1,4 +1,4 @@
-//! Who calls, and a gate that every call of a server passes before anything of it is read.
+//! The identity of callers, and the gate that every call of a server passes before any of its content is read.
 //!
 //! ```text
 //!   connection ─▶ Identity ─▶ Gate::caller ─▶ Gate::admit(caller, path) ─┬─▶ service (finds the Caller in the request)
@@ -6,10 +6,11 @@
 //!                            Gate::answered(path, code, duration) ◀─ answer
 //!                                 Gate::unread(caller, bytes) ◀─ each part of it, until the connection has written it
 //! ```
-//! The trace of a call that carries one (`traceparent`) is that of everything done for it. What is admitted is the gate's business.
+//! If a call carries a trace context (`traceparent`), everything done for the call belongs to that trace. The gate decides which calls are
+//! admitted.
 //!
-//! A server that drains refuses what is new ([`ending`]), and knows what is still under way: a call is over when its last byte of
-//! answer is. Health and reflection are answered to the end, and nobody waits for them.
+//! A server that drains refuses new calls ([`ending`]) and tracks the calls under way: a call ends with the last byte of its answer. Health
+//! and reflection are answered to the end, and draining does not wait for them.
 
 use crate::access::{Caller, HEALTH_CHECK};
 use crate::connections::{Link, LinkInfo, OutOfConnections};
@@ -35,51 +36,51 @@ use tonic_types::{ErrorDetails, StatusExt};
 use tower_layer::Layer;
 use tracing::Instrument;
 
-/// When whoever was refused because a process ends should ask again.
+/// Delay after which a client that was refused because the process ends should retry.
 const ENDING_RETRY: Duration = Duration::from_millis(500);
 
-/// Who is at the other end of a connection, as far as the connection itself proves it.
+/// The other end of a connection, as far as the connection itself proves it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Identity {
     /// A user of this machine, over a Unix socket.
     User {
-        /// As the kernel says.
+        /// The user id, from the kernel.
         uid: u32,
-        /// The process that connected, where the kernel says.
+        /// The process that connected, if the kernel tells.
         pid: Option<i32>,
     },
-    /// Who holds the key of a certificate that the server's authority signed.
+    /// The holder of the private key of a certificate that the server's certificate authority signed.
     Certificate {
-        /// The certificate as it was shown, DER.
+        /// The certificate as presented, in DER.
         der: Arc<[u8]>,
     },
-    /// Nobody in particular: TCP without TLS.
+    /// Unknown: TCP without TLS.
     Anonymous,
 }
 
 /// Decides about calls. Shared by all connections of a server.
 pub trait Gate: Send + Sync + 'static {
-    /// Who is at the other end of a connection.
+    /// The caller at the other end of a connection.
     fn caller(&self, identity: &Identity) -> Caller;
 
-    /// Whether a call may go on; what it leaves in the extensions the service finds in the request.
+    /// Whether a call may go on. The service finds in the request what this method puts into the extensions.
     ///
     /// # Errors
     /// The status that the caller gets instead.
     fn admit(&self, caller: &Caller, path: &str, extensions: &mut http::Extensions) -> Result<(), Status>;
 
-    /// Changes when [`Gate::caller`] may answer otherwise than before. Calls under way end whose caller has lost something by it.
+    /// Notifies when [`Gate::caller`] may answer differently. Calls under way end if their caller has lost a permission.
     fn changes(&self) -> Option<watch::Receiver<()>> {
         None
     }
 
-    /// Called about once a second, also where nobody calls.
+    /// Called about once a second, even without calls.
     fn look_again(&self) {}
 
-    /// A call was answered (a stream: began to be).
+    /// Records the answer to a call (for a stream: the beginning of the answer).
     fn answered(&self, path: &str, code: Code, took: Duration);
 
-    /// So many bytes of an answer are there, and wait until their reader has room for them: then the permit is dropped.
+    /// Called when bytes of an answer wait for their reader; the permit is dropped when the reader has taken them.
     ///
     /// # Errors
     /// The status that the caller gets instead of the rest of the answer.
@@ -87,12 +88,12 @@ pub trait Gate: Send + Sync + 'static {
         Ok(None)
     }
 
-    /// A connection was not accepted, or a call refused, because there are too many connections.
+    /// Records that a connection was not accepted, or a call refused, because of too many connections.
     fn out_of_connections(&self, _why: &OutOfConnections) {}
 }
 
-/// What a gate leaves in the extensions of a call that it admits: dropped when the last byte of the answer has been sent, or nobody
-/// wants it any more.
+/// A guard that a gate puts into the extensions of an admitted call. It is dropped when the last byte of the answer has been sent, or the
+/// caller does not want the answer any more.
 #[derive(Clone)]
 pub struct Permit {
     _held: Arc<dyn Any + Send + Sync>,
@@ -105,13 +106,13 @@ impl fmt::Debug for Permit {
 }
 
 impl Permit {
-    /// Holds something for as long as the call is under way.
+    /// Holds `held` for as long as the call is under way.
     pub fn new(held: impl Send + Sync + 'static) -> Permit {
         Permit { _held: Arc::new(held) }
     }
 }
 
-/// Who made a request.
+/// The identity of a request's sender.
 pub fn identity_of(extensions: &http::Extensions) -> Identity {
     if let Some(LinkInfo { info, .. }) = extensions.get::<LinkInfo<UdsConnectInfo>>() {
         return match info.peer_cred {
@@ -127,7 +128,7 @@ pub fn identity_of(extensions: &http::Extensions) -> Identity {
     }
 }
 
-/// Which connection a request came over.
+/// The connection that a request came over.
 fn link_of(extensions: &http::Extensions) -> Option<&Link> {
     let over_unix = extensions.get::<LinkInfo<UdsConnectInfo>>().map(|known| &known.link);
     let over_tcp = || extensions.get::<LinkInfo<TcpConnectInfo>>();
@@ -135,14 +136,14 @@ fn link_of(extensions: &http::Extensions) -> Option<&Link> {
     over_unix.or_else(|| over_tcp().or_else(over_tls).map(|known| &known.link))
 }
 
-/// What a process that ends says to whoever asks it for something new.
+/// The refusal of new calls by a process that ends.
 pub fn ending() -> Status {
     let mut details = ErrorDetails::with_error_info("ENDING", "ratn", []);
     details.set_retry_info(Some(ENDING_RETRY));
     Status::with_error_details(Code::Unavailable, "the process is ending: ask its successor", details)
 }
 
-/// Fires when the server of a request drains; among the request's extensions.
+/// Fires when the server of a request drains; stored in the request's extensions.
 #[derive(Debug, Clone)]
 pub(crate) struct Draining(pub(crate) CancellationToken);
 
@@ -154,35 +155,35 @@ pub(crate) struct Calls {
 }
 
 impl Calls {
-    /// Those of a server that drains with the token.
+    /// The calls of a server that drains when this token fires.
     pub(crate) fn until(draining: CancellationToken) -> Calls {
         let under_way = TaskTracker::new();
-        // Whoever waits while there are none does not wait for a first one.
+        // Closed from the start: a wait while no call is under way returns at once.
         under_way.close();
         Calls { under_way, draining }
     }
 
-    /// Returns when none is under way.
+    /// Returns when no call is under way.
     pub(crate) async fn ended(&self) {
         self.under_way.wait().await;
     }
 
-    /// One more, which is nobody's where `counted` is false.
+    /// Begins a call; it is not tracked if `counted` is false.
     fn begin(&self, counted: bool) -> Result<Option<TaskTrackerToken>, Status> {
         if !counted {
             return Ok(None);
         }
-        // Counted first: either it is waited for, or it sees that it comes too late.
+        // Count the call before checking: either draining waits for it, or it sees that it comes too late.
         let call = self.under_way.token();
         if self.draining.is_cancelled() { Err(ending()) } else { Ok(Some(call)) }
     }
 }
 
-/// Streams that carry calls, each of which has a span of its own.
+/// Streams that carry many calls; each of those calls has a span of its own.
 const CARRIERS: [&str; 3] =
     ["/ratn.v1.ResourceService/Session", "/ratn.v1.ActionService/Perform", "/ratn.v1.WorldPoolService/Calls"];
 
-/// Whether a call is one of the daemon's own services.
+/// Whether a call belongs to the daemon's own services (not to gRPC's).
 fn is_counted(path: &str) -> bool {
     !path.starts_with("/grpc.")
 }
@@ -267,21 +268,21 @@ where
     }
 }
 
-/// What lasts as long as the call does, or why it may not begin.
+/// Admits a call: returns the values to hold as long as the call lasts, or the reason why it may not begin.
 fn admit(gate: &Arc<dyn Gate>, calls: &Calls, request: &mut http::Request<Body>) -> Result<Held, Status> {
     let path = request.uri().clone();
     let counted = is_counted(path.path());
     if counted {
         protocol::check(request.headers())?;
     }
-    // First this: no change of the roles is missed.
+    // Subscribe first, so that no change of the roles is missed.
     let changes = gate.changes();
     let identity = identity_of(request.extensions());
     let caller = gate.caller(&identity);
     gate.admit(&caller, path.path(), request.extensions_mut())?;
     let permit = request.extensions_mut().remove::<Permit>();
     let in_use = match link_of(request.extensions()) {
-        // Whoever watches over the process is answered also where the caller's share is used up.
+        // A health check is answered even if the caller's share of connections is used up.
         Some(link) if path.path() == HEALTH_CHECK => {
             link.touch();
             None
@@ -299,7 +300,7 @@ fn admit(gate: &Arc<dyn Gate>, calls: &Calls, request: &mut http::Request<Body>)
     Ok(Held { _call: call, _permit: permit, _in_use: in_use, revocation, unread })
 }
 
-/// The code of an answer that is only a status; a body may still end with another.
+/// The status code of an answer that consists of headers only; an answer with a body may still end with another code.
 fn code_of(headers: &http::HeaderMap) -> Code {
     headers.get("grpc-status").map_or(Code::Ok, |code| Code::from_bytes(code.as_bytes()))
 }

@@ -1,11 +1,12 @@
-//! One of several servers leads, the others stand by: a connection to them is a connection to the one that leads, and moves with it.
+//! Connects to a group of servers of which one leads and the others stand by: the connection goes to the leader, and moves with it.
 //!
 //! ```text
-//!   connect ── which of them says SERVING? ──▶ connection ◀── it says SERVING again ──┐
-//!      ▲                                        │    └── it says nothing, or NOT_SERVING ──▶ in doubt: the others are asked, too
-//!      └──────────── made anew ◀── broken ──────┴───────────── another one says SERVING ◀──┘
+//!   connect ── which server is SERVING? ─────▶ connection ◀── it is SERVING again ────┐
+//!      ▲                                        │    └── no answer, or NOT_SERVING ──▶ in doubt: the others are asked, too
+//!      └──────────── connect again ◀── broken ──┴───────────── another one is SERVING ◀──┘
 //! ```
-//! Only gRPC health is asked: who stands by says NOT_SERVING. Whoever uses the connection sees what it sees of any connection that breaks.
+//! Servers are asked by gRPC health only: a standby answers NOT_SERVING. The user of the connection sees a change of the leader as a broken
+//! connection.
 
 use crate::client::chain;
 use crate::endpoint::{Endpoint, connect_to_ask};
@@ -33,21 +34,21 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-/// One of them has to lead by then: before an attempt to connect is given up ([`crate::endpoint::CONNECT_TIMEOUT`]).
+/// Time limit for finding the leader; it ends before the connection attempt is given up ([`crate::endpoint::CONNECT_TIMEOUT`]).
 const FIND_DEADLINE: Duration = Duration::from_millis(2_800);
-/// How often a server is asked whether it still leads.
+/// Interval between two health checks of the leader.
 const ASK_INTERVAL: Duration = Duration::from_millis(200);
-/// And how soon it has to answer.
+/// Time limit for an answer to a health check.
 const ANSWER_DEADLINE: Duration = Duration::from_millis(500);
-/// With an answer that takes longer than this it is in doubt.
+/// If a health check takes longer than this, the leader is in doubt.
 const PATIENCE: Duration = Duration::from_millis(300);
-/// A leader that was found is connected to without being asked again for so long.
+/// How long a leader that was found is connected to without another health check.
 const FOUND_FOR: Duration = Duration::from_secs(1);
-/// The pause between two questions of a server that does not lead; grows from the first to the second. Short: these are asked only while
-/// no server is known to lead.
+/// Pause between two health checks of a server that does not lead; it grows from the first value to the second. Short, because these checks
+/// happen only while no leader is known.
 const LOOK_INTERVALS: (Duration, Duration) = (Duration::from_millis(25), Duration::from_millis(100));
 
-/// Connects to whichever of several servers leads.
+/// Connects to the leader of several servers.
 #[derive(Debug, Clone)]
 pub(crate) struct LeaderConnector {
     members: Arc<[Endpoint]>,
@@ -55,7 +56,7 @@ pub(crate) struct LeaderConnector {
     found: Found,
 }
 
-/// Who was found to lead when the connection before was broken for it, and when: the next connection goes there without a question.
+/// The leader that was found when the previous connection was broken for it, and the time: the next connection goes there without a check.
 type Found = Arc<Mutex<Option<(Endpoint, Instant)>>>;
 
 impl LeaderConnector {
@@ -100,7 +101,7 @@ impl Service<Uri> for LeaderConnector {
     }
 }
 
-/// The connection, which breaks when another one leads.
+/// The connection; it breaks when another server leads.
 fn watched(
     stream: Box<dyn Stream>,
     members: Arc<[Endpoint]>,
@@ -115,10 +116,10 @@ fn watched(
     TokioIo::new(ToLeader { stream, broken: Box::pin(broken.cancelled_owned()), _watched: watched.drop_guard() })
 }
 
-/// What each server that does not lead said last.
+/// The last answer of each server that does not lead.
 type Said = Mutex<BTreeMap<Endpoint, String>>;
 
-/// The first that says that it leads, apart from one of them.
+/// The first server, other than `apart_from`, that says that it leads.
 async fn find(members: &[Endpoint], tls: &ClientTls, apart_from: Option<&Endpoint>, said: &Said) -> Endpoint {
     let others = members.iter().filter(|member| Some(*member) != apart_from);
     let mut seeking: FuturesUnordered<_> = others
@@ -139,17 +140,17 @@ async fn find(members: &[Endpoint], tls: &ClientTls, apart_from: Option<&Endpoin
     }
 }
 
-/// Breaks a connection when its server leads no more, or says nothing, and another one leads.
+/// Breaks a connection if its server does not lead any more, or does not answer, and another server leads.
 async fn watch(members: Arc<[Endpoint]>, tls: ClientTls, leader: Endpoint, found: Found, broken: CancellationToken) {
     let mut asked = Asked { member: &leader, tls: &tls, client: None };
     loop {
         tokio::time::sleep(ASK_INTERVAL).await;
         panic_point("leader-watch");
-        // A connection that has to be made anew takes no longer than an answer may.
+        // Connecting again counts into the time limit.
         if let Ok(Ok(())) = tokio::time::timeout(PATIENCE, asked.leads()).await {
             continue;
         }
-        // In doubt. A leader that is only slow is not left: as long as it leads no other one says that it does.
+        // In doubt. A leader that is only slow is not abandoned: as long as it leads, no other server says that it does.
         let said = Said::default();
         tokio::select! {
             () = asked.leads_again() => {}
@@ -170,18 +171,18 @@ struct Asked<'a> {
 }
 
 impl Asked<'_> {
-    /// Returns when it says so.
+    /// Returns when the server says that it leads.
     async fn leads_again(&mut self) {
         while !matches!(tokio::time::timeout(ANSWER_DEADLINE, self.leads()).await, Ok(Ok(()))) {
             tokio::time::sleep(ASK_INTERVAL).await;
         }
     }
 
-    /// Whether it says so; else what it says.
+    /// Checks whether the server says that it leads; the error is its other answer.
     async fn leads(&mut self) -> Result<(), String> {
         let had_one = self.client.is_some();
         let asked = self.ask().await;
-        // The connections of a standby end when it begins to lead.
+        // A standby closes its connections when it begins to lead.
         if had_one && self.client.is_none() { self.ask().await } else { asked }
     }
 
@@ -193,7 +194,7 @@ impl Asked<'_> {
         let question = client.check(HealthCheckRequest { service: String::new() });
         let answer = tokio::time::timeout(ANSWER_DEADLINE, question).await;
         let answer = answer.map_err(|_| "no answer".to_owned())?.map_err(|status| status.message().to_owned())?;
-        // Kept for the next question, as it has answered.
+        // Keep the client for the next check, because it has answered.
         self.client = Some(client);
         let leads = answer.into_inner().status() == ServingStatus::Serving;
         if leads { Ok(()) } else { Err("it stands by, or cannot serve: NOT_SERVING".to_owned()) }
@@ -219,7 +220,7 @@ async fn open(endpoint: &Endpoint, tls: &ClientTls) -> Result<Box<dyn Stream>, S
 trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
 impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
 
-/// A connection that breaks when its server leads no more.
+/// A connection that breaks when its server does not lead any more.
 pub(crate) struct ToLeader {
     stream: Box<dyn Stream>,
     broken: Pin<Box<WaitForCancellationFutureOwned>>,

@@ -16,19 +16,20 @@
 //! - [`action::Action`]: the trait; [`action::GoalContext`]: inputs by type (`goal.input_joints("start")?`), `seed`, `lease`,
 //!   `cancelled`, `progress("…")`, `world(&patterns)`, `call("Camera", "capture", inputs)`.
 //! - [`action::ActionServer`]: fencing, idempotent goals, one at a time where asked, cancel, bounded results.
-//! - [`lease_watch::LeaseWatch`]: who holds this provider's resources, as the resource manager says; a goal ends with its lease.
+//! - [`lease_watch::LeaseWatch`]: the holders of this provider's resources, as reported by the resource manager; a goal ends with its
+//!   lease.
 //! - [`worker::Worker`]: all of this in one builder; [`worker::Worker::from_args`] reads the arguments of a worker process.
 //!   [`prelude`] has the names that a worker needs, [`testing::perform`] performs a goal in a test.
 //! - [`action::Signature`]: the ports, outcomes and annotations of an action.
 //! - [`safety::Safety`]: emergency stop and hold, for drivers of hardware that moves; [`safety::SafetyClient`] asks for them.
 //!
 //! # Asking others
-//! - [`client::Channels`] keeps one channel per endpoint; [`client::ActionClient`], [`client::ResourceClient`],
-//!   [`client::WorldClient`], [`client::ProcessClient`] speak the cores' types; [`client::CallError`] distinguishes a refusal from a
-//!   crash; [`client::wait_until_serving`] asks gRPC health.
-//! - [`session::Session`] keeps a session with the resource manager alive and reports when it was lost;
-//!   [`provider::Provider`] offers resources in that session, and offers them again after the manager came back. Both measure how long
-//!   they may trust the manager with [`boot_clock::BootClock`], which goes on while the machine is suspended.
+//! - [`client::Channels`] keeps one channel per endpoint; [`client::ActionClient`], [`client::ResourceClient`], [`client::WorldClient`],
+//!   [`client::ProcessClient`] use the types of the cores; [`client::CallError`] distinguishes a refusal from a crash;
+//!   [`client::wait_until_serving`] asks gRPC health.
+//! - [`session::Session`] keeps a session with the resource manager alive and reports when it was lost; [`provider::Provider`] offers
+//!   resources in that session, and offers them again after the manager restarted. Both measure with [`boot_clock::BootClock`] for how long
+//!   they may trust the manager; it goes on while the machine is suspended.
 //!
 //! The SDK deliberately decides nothing: it does not retry goals and does not choose resources.
 

@@ -1,11 +1,11 @@
-//! Where a worker sends its spans: as `[service.otlp]` of its system's config says, the file of which its callers' roles are.
+//! Where a worker sends its spans: as `[service.otlp]` says in its system's config, the file with the roles of its callers.
 
 use crate::access::ACCESS_VARIABLE;
 use ratn_otlp::OtlpConfig;
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 
-/// What of a system's config is read here.
+/// The part of a system's config that is read here.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 struct SystemFile {
@@ -18,11 +18,11 @@ struct ServiceSection {
     otlp: OtlpConfig,
 }
 
-/// Starts the sender of the process, where the config says so. One that cannot be used costs the worker its spans, and it says so.
+/// Starts the process's sender of spans, if the config asks for it. With an invalid config the worker sends no spans and logs that.
 pub(crate) fn start(config: Option<&Path>, id: &str) {
     let from_environment = || std::env::var_os(ACCESS_VARIABLE).filter(|value| !value.is_empty()).map(PathBuf::from);
     let Some(file) = config.map(Path::to_owned).or_else(from_environment) else { return };
-    // A file that cannot be read is refused for its roles.
+    // An unreadable file is refused where the roles are read.
     let Ok(text) = ratn_regular_file::read_text(&file, ratn_regular_file::USUAL) else { return };
     let file = file.display();
     let config = match toml::from_str::<SystemFile>(&text) {

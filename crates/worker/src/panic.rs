@@ -1,16 +1,16 @@
-//! A panic in a task or thread that the process is of no use without ends the process, so that whoever watches over it (systemd, a process
-//! manager) starts another one. Without this only the task or thread would end, and the process would go on without it, unnoticed.
+//! A panic in a task or thread that the process cannot do without ends the process, so that its supervisor (systemd, a process manager)
+//! starts another one. Otherwise only the task or thread would end, and the process would go on without it, unnoticed.
 //!
-//! An action that panics is no such case: its goal is aborted (`action/run.rs`). The core of a daemon tells its
-//! [`crate::vitals::Vitals`] of its panic, which end serving, too.
+//! A panic in an action is not handled here: its goal is aborted (`action/run.rs`). The core of a daemon reports its panic to its
+//! [`crate::vitals::Vitals`], which end serving, too.
 
 use crate::vitals::CoreFailure;
 use futures::FutureExt;
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-/// Does `work`. A panic in it ends the process with [`crate::vitals::EXIT_CODE_PANICKED`]; `part` says in the log what of the process
-/// has ended.
+/// Performs `work`. A panic in it ends the process with [`crate::vitals::EXIT_CODE_PANICKED`]; the log names `part` as the part that
+/// panicked.
 pub async fn exit_on_panic<T>(part: &str, work: impl Future<Output = T>) -> T {
     AssertUnwindSafe(work).catch_unwind().await.unwrap_or_else(|panic| exit(part, &*panic))
 }

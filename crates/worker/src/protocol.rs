@@ -1,11 +1,12 @@
-//! Which versions of the protocol a process speaks. Both ends of a call may be of different versions of the program: they run where they
-//! have a version of the protocol in common, else the first call is refused with both named.
+//! Protocol versions. Both ends of a call may be of different versions of the program: they work together if they have a protocol version
+//! in common; otherwise the first call is refused with both versions named.
 //!
 //! ```text
 //!   ratn-protocol: 1-1 0.1.0            oldest and newest version of the protocol, and the program's own
 //! ```
-//! Every call over a channel of [`crate::endpoint`] says it, pings of sessions too, and every server of [`crate::server`] looks. A client that
-//! does not say it (one of another program) is let in: it has read the proto files and knows what it speaks.
+//! Every call over a channel of [`crate::endpoint`] carries this header, also the pings of sessions, and every server of [`crate::server`]
+//! checks it. A client without the header (another program) is admitted: its author has read the proto files and knows which version it
+//! speaks.
 
 use std::fmt;
 use std::str::FromStr;
@@ -15,15 +16,15 @@ use tonic_types::{ErrorDetails, StatusExt};
 
 /// The header and metadata key.
 pub const HEADER: &str = "ratn-protocol";
-/// The version of this program. It grows with a change of the proto files after which an older program would do something else than
-/// it is asked; a field or a method more does not need it.
+/// The newest protocol version of this program. It is incremented by a change of the proto files that would make an older program do
+/// something else than asked; an additional field or method does not need it.
 pub const NEWEST: u32 = 1;
-/// The oldest that this program goes on with.
+/// The oldest protocol version that this program works with.
 pub const OLDEST: u32 = 1;
-/// As every call says it.
+/// The header value of this program.
 const OWN: HeaderValue = HeaderValue::from_static(concat!("1-1 ", env!("CARGO_PKG_VERSION")));
 
-/// What a process speaks.
+/// The protocol versions of a process.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Spoken {
     oldest: u32,
@@ -58,12 +59,12 @@ impl FromStr for Spoken {
     }
 }
 
-/// Says it with a call.
+/// Adds the header to a call.
 pub(crate) fn say(headers: &mut HeaderMap) {
     headers.insert(HEADER, OWN);
 }
 
-/// Whether a call of who says this is understood.
+/// Checks whether this program can serve the caller with these headers.
 pub(crate) fn check(headers: &HeaderMap) -> Result<(), Status> {
     let Some(said) = headers.get(HEADER) else { return Ok(()) };
     let Some(theirs) = said.to_str().ok().and_then(|text| text.parse::<Spoken>().ok()) else {

@@ -1,14 +1,14 @@
 //! Offers resources under a session, and withdraws them. A resource that the resource manager has forgotten is offered again. While the
-//! manager cannot be reached, offers and withdrawals wait; one that is not answered within `ANSWERED_WITHIN` is asked again.
+//! manager cannot be reached, offers and withdrawals wait; a call that is not answered within `ANSWERED_WITHIN` is repeated.
 //!
-//! A provider watches its resources at the manager. When somebody else has deleted one, the provider logs that and offers it again. What
-//! a new watch shows first is compared with what was offered: a session may have ended and been made anew unnoticed, when the answer of
-//! the manager that said so was lost.
-//! One of what moves ([`Provider::start_at_rest`]) offers nothing at which an earlier goal still runs, and nothing before its driver has said
-//! that it is at rest. One that does not follow the leases of what moves (a process manager's, of its pooled drivers) offers what it has
-//! offered before, and the manager has lost, when the resource's bound for standstill has passed: those who held it may not have heard yet.
-//! An offer whose answer was lost counts as one that the manager had, and so does what an earlier process offered in the same session.
-//! What the manager has had and refuses now (somebody took a role away) is asked for again, less often.
+//! A provider watches its resources at the manager. When somebody else has deleted a resource, the provider logs that and offers it again.
+//! The first snapshot of a new watch is compared with the offered resources: the session may have ended and been made again unnoticed, if
+//! the manager's answer about that was lost.
+//! A provider of hardware that moves ([`Provider::start_at_rest`]) does not offer a resource on which an earlier goal still runs, and
+//! offers nothing before its driver has reported rest. A provider that does not follow the leases of what moves (a process manager, for its
+//! pooled drivers) offers a resource that the manager has lost again only when the resource's bound for standstill has passed: its former
+//! holders may not have heard yet. An offer whose answer was lost counts as accepted, and so do the offers of an earlier process in the
+//! same session. If the manager had a resource and refuses it now (somebody took a role away), it is offered again, less often.
 
 mod bounds;
 
@@ -31,19 +31,19 @@ use tokio::time::timeout;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::Code;
 
-/// Resources that the manager is asked for at a time.
+/// Number of calls to the manager that run concurrently.
 const AT_ONCE: usize = 16;
-/// A part of a process, for its log.
+/// The name of this part of the process in the log.
 const PART: &str = "the provider of resources";
-/// An answer is waited for this long; then the manager is asked again, over a connection made anew where the old one broke.
+/// Time limit for an answer; then the manager is asked again, over a new connection if the old one broke.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(3);
-/// The pause before the manager is asked again.
+/// Pause before the manager is asked again.
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
-/// The same where the manager has refused what it had before.
+/// The same pause if the manager refuses what it had before.
 const REFUSED_INTERVAL: Duration = Duration::from_secs(1);
 
-/// The `standstill_ms` of what moves, at a provider whose session lives for `session_ttl` without a ping: for so long it may not have heard
-/// that a lease has ended, and stops by itself then; its actions have returned [`STOP_GRACE`] after that.
+/// The `standstill_ms` of hardware that moves, for a provider whose session lives for `session_ttl` without a ping. For so long the
+/// provider may not hear that a lease has ended; then it stops by itself, and its actions have returned [`STOP_GRACE`] later.
 pub fn standstill_bound(session_ttl: Duration) -> Duration {
     session_ttl + STOP_GRACE
 }
@@ -61,50 +61,50 @@ struct Shared {
     /// The session's id.
     session: String,
     state: watch::Receiver<SessionState>,
-    /// Held during a call, so that an older state never overtakes a newer one.
+    /// Locked during a call, so that an older state never overtakes a newer one.
     desired: Mutex<Desired>,
     missing: Notify,
-    /// Of the resources that are offered only where nothing moves.
+    /// The leases of resources that are offered only at rest.
     leases: Option<LeaseWatch>,
-    /// How often the session was made, as far as that is taken into account in what is desired; of the first nothing was there before.
+    /// The session generation that `desired` takes into account; before the first generation nothing was offered.
     generation: AtomicU64,
-    /// Of what is offered: what is watched.
+    /// The kinds of the offered resources, which are watched.
     kinds: watch::Sender<BTreeSet<String>>,
 }
 
-/// What shall be at the manager, and what of it may not be offered yet.
+/// The desired state at the manager, and when resources may be offered.
 #[derive(Debug, Default)]
 struct Desired {
-    /// By id.
+    /// By resource id.
     states: BTreeMap<String, DesiredState>,
     bounds: Bounds,
 }
 
-/// What a resource shall be at the manager: there, or gone.
+/// The desired state of a resource at the manager: offered or withdrawn.
 #[derive(Debug, Default)]
 struct DesiredState {
-    /// The resource to be offered; `None` for one that is to be withdrawn.
+    /// The resource to be offered; `None` for a resource to be withdrawn.
     resource: Option<Resource>,
-    /// Why the manager does not have this state yet, as the log has said.
+    /// Why the manager does not have this state yet; the last reason that was logged.
     problem: String,
-    /// The manager's words, where another session has a resource of the id.
+    /// The manager's message, if another session has a resource of the same id.
     taken: Option<String>,
     presence: Presence,
-    /// The manager has confirmed just this state, and nothing has changed it since.
+    /// The manager has confirmed exactly this state, and nothing has changed it since.
     confirmed: bool,
-    /// The widest bound for standstill that it was offered with.
+    /// The longest bound for standstill that the resource was offered with.
     standstill: Option<Duration>,
 }
 
-/// What is known of a resource at the manager.
+/// Whether the manager has a resource, as far as known.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
 enum Presence {
-    /// The manager has not got it.
+    /// The manager does not have it.
     #[default]
     Absent,
-    /// It was offered, and no answer has come: the manager may have it, and may have granted it.
+    /// It was offered without an answer: the manager may have it, and may have granted it.
     Unknown,
-    /// The manager has confirmed that it has it.
+    /// The manager has confirmed it.
     There,
 }
 
@@ -117,8 +117,8 @@ impl Provider {
         Provider::start_with(channels, endpoint, session, None)
     }
 
-    /// As [`Provider::start`], for resources that `leases` watches. A resource that the manager does not have (any more) is offered once the
-    /// driver has called [`LeaseWatch::brought_to_rest`] and no goal runs at the resource. So its next holder finds it at rest.
+    /// As [`Provider::start`], for resources that `leases` watches. A resource that the manager does not have (any more) is offered when
+    /// the driver has called [`LeaseWatch::brought_to_rest`] and no goal runs on the resource. So its next holder finds it at rest.
     ///
     /// # Errors
     /// As [`Channels::get`].
@@ -160,16 +160,16 @@ impl Provider {
         &self.shared.client
     }
 
-    /// Offers a resource (its id must not be empty), or updates one that was offered before. True once the manager has it. False when the
+    /// Offers a resource (its id must not be empty), or updates one that was offered before. True if the manager has it now. False if the
     /// manager cannot be reached, or another session still has a resource of this id: it will be offered as soon as possible.
     ///
     /// # Errors
-    /// [`CallError::Refused`] when the manager refuses the resource. It is then not offered again, unless the manager had it before.
+    /// [`CallError::Refused`] if the manager refuses the resource. It is then not offered again, unless the manager had it before.
     pub async fn offer(&self, resource: Resource) -> Result<bool, CallError> {
         self.set_desired(resource.id.clone(), Some(resource)).await
     }
 
-    /// As [`Provider::offer`] for each of them, several at a time; what became of each, by id.
+    /// As [`Provider::offer`] for each of the resources, several at a time; returns the results by id.
     pub async fn offer_all(&self, resources: Vec<Resource>) -> Vec<(String, Result<bool, CallError>)> {
         let mut desired = self.shared.desired.lock().await;
         let ids: BTreeSet<String> = resources.iter().map(|resource| resource.id.clone()).collect();
@@ -180,8 +180,8 @@ impl Provider {
         self.shared.offer(&mut desired, &ids).await
     }
 
-    /// An earlier process offered these in the same session, and the manager still had them when it was asked: they may be leased. With each
-    /// comes the bound for standstill that it was offered with.
+    /// Registers resources that an earlier process offered in the same session and that the manager still had when it was asked: they may
+    /// be leased. With each comes the bound for standstill that it was offered with.
     pub async fn offered_before(&self, resources: Vec<(Resource, Option<Duration>)>) {
         let mut desired = self.shared.desired.lock().await;
         for (resource, standstill) in resources {
@@ -192,8 +192,8 @@ impl Provider {
         }
     }
 
-    /// These were offered by an earlier session or process, and what that was leased to may still move: each is offered when its bound for
-    /// standstill has passed from now on.
+    /// Registers resources that an earlier session or process offered: what they were leased for may still move. Each is offered when its
+    /// bound for standstill has passed from now on.
     pub async fn may_move(&self, resources: &[Resource]) {
         let mut desired = self.shared.desired.lock().await;
         for resource in resources {
@@ -201,16 +201,16 @@ impl Provider {
         }
     }
 
-    /// Withdraws a resource; whoever holds a lease of it loses it. True once it is gone. False when the manager cannot be reached: the
-    /// resource will be withdrawn as soon as possible.
+    /// Withdraws a resource; its holders lose their leases. True if it is gone now. False if the manager cannot be reached: the resource
+    /// will be withdrawn as soon as possible.
     ///
     /// # Errors
-    /// [`CallError::Refused`] when the manager refuses; it is not asked again.
+    /// [`CallError::Refused`] if the manager refuses; it is not asked again.
     pub async fn withdraw(&self, id: &str) -> Result<bool, CallError> {
         self.set_desired(id.to_owned(), None).await
     }
 
-    /// Withdraws a resource unless somebody holds it. True once it is gone. False, and the resource stays, when it is held or the manager
+    /// Withdraws a resource unless it is leased. True if it is gone now. False, and the resource stays, if it is leased or the manager
     /// cannot be reached.
     pub async fn withdraw_unless_held(&self, id: &str) -> bool {
         let mut desired = self.shared.desired.lock().await;
@@ -218,7 +218,7 @@ impl Provider {
         if !self.shared.state.borrow().alive {
             return false;
         }
-        // Only what is free is deleted so, and its attributes are no other's.
+        // This call deletes only free resources, and no other resource has these attributes.
         let mut requirement = Requirement::new(ResourceOperation::Delete, resource.kind);
         requirement.class = Some(resource.class);
         requirement.attributes = resource.attributes;
@@ -245,13 +245,13 @@ impl Provider {
         asked.into_iter().next().map_or(Ok(true), |(_, done)| done)
     }
 
-    /// Why the manager does not have a resource that is offered: another session has one of its id. That session may end, so the resource
-    /// is offered again.
+    /// The reason why the manager does not have an offered resource: another session has one of the same id. That session may end, so the
+    /// resource is offered again.
     pub async fn refusal(&self, id: &str) -> Option<String> {
         self.shared.desired.lock().await.states.get(id).and_then(|entry| entry.taken.clone())
     }
 
-    /// The resources that are offered, in the order of their ids.
+    /// The offered resources, sorted by id.
     pub async fn offered(&self) -> Vec<Resource> {
         self.shared.desired.lock().await.states.values().filter_map(|entry| entry.resource.clone()).collect()
     }
@@ -262,8 +262,8 @@ impl Shared {
         self.kinds.send_if_modified(|kinds| !kinds.contains(kind) && kinds.insert(kind.to_owned()));
     }
 
-    /// Whether the manager says that it has a resource, of this provider's session. Where it says nothing, the resource is offered again:
-    /// that changes nothing where it was there.
+    /// Whether the manager confirms that it has a resource of this provider's session. Without an answer the resource is offered again,
+    /// which changes nothing if the manager has it.
     async fn is_there(&self, id: &str) -> bool {
         answered(&self.client, self.client.get(id)).await.is_ok_and(|resource| self.is_own(&resource))
     }
@@ -272,7 +272,7 @@ impl Shared {
         resource.session == self.session
     }
 
-    /// A resource is gone. What was to be there, and was, is offered again.
+    /// Handles the loss of a resource at the manager: if it should be there, and was, it is offered again.
     async fn vanished(&self, id: &str, reason: &str) {
         let mut desired = self.desired.lock().await;
         let Desired { states, bounds } = &mut *desired;
@@ -289,7 +289,7 @@ impl Shared {
         self.missing.notify_one();
     }
 
-    /// As [`Shared::ask`], for a caller that hears of a refusal: what is refused and not there is not desired any more.
+    /// As [`Shared::ask`], for a caller that gets the refusal: a resource that is refused and absent is not desired any more.
     async fn offer(&self, desired: &mut Desired, ids: &BTreeSet<String>) -> Vec<(String, Result<bool, CallError>)> {
         let concluded = self.ask(desired, ids).await;
         for (id, _) in concluded.iter().filter(|(_, done)| done.is_err()) {
@@ -300,8 +300,8 @@ impl Shared {
         concluded
     }
 
-    /// Asks for these, several at a time, if the session lives: true for what is so now, false for what will be asked for again. What
-    /// is gone, or may not be withdrawn, is not desired any more.
+    /// Makes the calls for these resources, several at a time, if the session lives. True: the desired state is reached; false: the call
+    /// will be repeated. A resource that is gone, or may not be withdrawn, is not desired any more.
     async fn ask(&self, desired: &mut Desired, ids: &BTreeSet<String>) -> Vec<(String, Result<bool, CallError>)> {
         if !self.state.borrow().alive {
             self.missing.notify_one();
@@ -330,7 +330,7 @@ impl Shared {
             match &done {
                 Ok(false) => self.missing.notify_one(),
                 Ok(true) if entry.resource.is_some() => entry.confirmed = true,
-                // The manager may have had it, and have leased it.
+                // The manager may have had the resource, and have leased it.
                 Err(_) if entry.resource.is_some() => self.missing.notify_one(),
                 Ok(true) | Err(_) => drop(desired.states.remove(&id)),
             }
@@ -339,7 +339,7 @@ impl Shared {
         concluded
     }
 
-    /// Of a session that was made anew nothing is there of before.
+    /// If the session was made again, nothing of the previous one is offered any more.
     fn look_at_session(&self, Desired { states, bounds }: &mut Desired) {
         let generation = self.state.borrow().generation;
         if self.generation.swap(generation, Ordering::SeqCst) != generation {
@@ -347,7 +347,7 @@ impl Shared {
         }
     }
 
-    /// Whether something still moves of what the manager has not got, or may.
+    /// Whether a resource that the manager does not have still moves, or may.
     fn moves(&self, desired: &Desired, id: &str) -> bool {
         let missing = |entry: &DesiredState| entry.resource.is_some() && entry.presence != Presence::There;
         desired.states.get(id).is_some_and(missing)
@@ -358,7 +358,7 @@ impl Shared {
     }
 }
 
-/// Tells the manager that a resource is there, or gone; its id and the answer.
+/// Creates or deletes a resource at the manager; returns its id and the answer.
 async fn ask(client: ResourceClient, id: String, resource: Option<Resource>) -> (String, Result<(), CallError>) {
     let answer = match resource {
         Some(resource) => answered(&client, client.create(resource)).await.map(drop),
@@ -367,7 +367,7 @@ async fn ask(client: ResourceClient, id: String, resource: Option<Resource>) -> 
     (id, answer)
 }
 
-/// What the manager answers, or that it does not within [`ANSWERED_WITHIN`]: one that hangs breaks no connection.
+/// The manager's answer, or an error after [`ANSWERED_WITHIN`]: a manager that hangs does not break the connection.
 async fn answered<T>(
     client: &ResourceClient,
     call: impl Future<Output = Result<T, CallError>>,
@@ -379,7 +379,7 @@ async fn answered<T>(
 }
 
 impl Desired {
-    /// From now on a resource is to be like this, or gone.
+    /// Sets the desired state of a resource: present with these values, or withdrawn.
     fn want(&mut self, id: String, resource: Option<Resource>) -> &mut DesiredState {
         let entry = self.states.entry(id).or_default();
         (entry.resource, entry.confirmed) = (resource, false);
@@ -388,7 +388,7 @@ impl Desired {
 }
 
 impl DesiredState {
-    /// The manager has not got it any more, and who held it may move it within its bound.
+    /// The manager does not have the resource any more; its former holder may move it until its bound has passed.
     fn gone(&mut self, id: &str, bounds: &mut Bounds) {
         self.confirmed = false;
         if std::mem::take(&mut self.presence) != Presence::Absent {
@@ -396,7 +396,7 @@ impl DesiredState {
         }
     }
 
-    /// The manager is being asked for it; what was known of it before.
+    /// Records that the manager is being asked; returns the presence before that.
     fn asked(&mut self) -> Presence {
         let before = self.presence;
         if let Some(resource) = &self.resource {
@@ -408,17 +408,17 @@ impl DesiredState {
         before
     }
 
-    /// What an answer says of whether the manager has it, or had it meanwhile.
+    /// Updates the presence by the manager's answer.
     fn learn(&mut self, id: &str, before: Presence, answer: &Result<(), CallError>, bounds: &mut Bounds) {
         match answer {
             Ok(()) if self.resource.is_some() => self.presence = Presence::There,
-            // Withdrawn: who held it has lost it, and may not have heard yet.
+            // Withdrawn: its holder has lost it, and may not have heard yet.
             Ok(()) => self.gone(id, bounds),
             Err(error) => match error.code() {
                 None | Some(Code::DeadlineExceeded) => {}
-                // Created and gone since, or gone before it was withdrawn.
+                // It was created and has gone since, or it was gone before it was withdrawn.
                 Some(Code::NotFound) => self.gone(id, bounds),
-                // The session is not known any more, nor what was offered in it.
+                // The session is unknown now, and so are the resources that were offered in it.
                 Some(Code::FailedPrecondition) => {
                     self.presence = before;
                     self.gone(id, bounds);
@@ -428,7 +428,7 @@ impl DesiredState {
         }
     }
 
-    /// Whether it is so now; an error where it never will be.
+    /// Whether the desired state is reached; an error if it never will be.
     fn conclude(&mut self, id: &str, answer: Result<(), CallError>) -> Result<bool, CallError> {
         match answer {
             Err(error) if self.resource.is_none() && error.code() == Some(Code::NotFound) => {}
@@ -457,8 +457,8 @@ impl DesiredState {
     }
 }
 
-/// Whether asking again later may help: nobody answers, the session is not known (yet, or any more), a session that has
-/// a resource of this id may end, or the resource was created and went with its session before that was answered (`NotFound`).
+/// Whether a retry may help: there was no answer, the session is unknown (not yet, or no longer, known), a session that has a resource of
+/// the same id may end, or the resource was created and went with its session before the answer (`NotFound`).
 fn is_transient(error: &CallError) -> bool {
     use Code::{AlreadyExists, DeadlineExceeded, FailedPrecondition, NotFound, ResourceExhausted};
     match error.code() {
@@ -469,7 +469,7 @@ fn is_transient(error: &CallError) -> bool {
     }
 }
 
-/// Asks whenever the session was made anew, and as long as something is not so yet.
+/// Makes the calls whenever the session was made again, and as long as a desired state is not reached.
 async fn restore(shared: Arc<Shared>) {
     let mut state = shared.state.clone();
     let mut restored = 0;
@@ -493,7 +493,8 @@ async fn restore(shared: Arc<Shared>) {
     }
 }
 
-/// Asks for everything that the manager has not confirmed; the pause before it is to be asked again, nothing where all is so.
+/// Makes the calls for everything that the manager has not confirmed; returns the pause before the next attempt, `None` if everything is
+/// confirmed.
 async fn ask_for_all(shared: &Shared) -> Option<Duration> {
     let mut desired = shared.desired.lock().await;
     if shared.state.borrow().alive {
@@ -509,7 +510,7 @@ async fn ask_for_all(shared: &Shared) -> Option<Duration> {
     shared.ask(&mut desired, &ids).await.into_iter().filter_map(pause).min()
 }
 
-/// Watches what is offered, as long as anything is; from the beginning again where the watch breaks or other kinds are offered.
+/// Watches the offered resources, as long as there are any; starts again if the watch breaks or other kinds are offered.
 async fn watch_own(shared: Arc<Shared>) {
     let mut kinds = shared.kinds.subscribe();
     loop {
@@ -531,7 +532,7 @@ async fn watch_kinds(shared: &Shared, kinds: &BTreeSet<String>) {
         let there = desired.states.iter().filter(|(_, entry)| entry.presence == Presence::There);
         there.map(|(id, _)| id.clone()).collect()
     };
-    // Known before the snapshot is made: what is not in it is gone.
+    // Known before the snapshot is made: a resource that the snapshot lacks is gone.
     let before = there(&*shared.desired.lock().await);
     let Ok(mut watch) = answered(&shared.client, shared.client.watch(&kinds)).await else { return };
     while let Ok(Some(update)) = watch.next().await {
@@ -541,7 +542,7 @@ async fn watch_kinds(shared: &Shared, kinds: &BTreeSet<String>) {
                 let shown: BTreeSet<String> = shown.map(|resource| resource.id).collect();
                 let now = there(&*shared.desired.lock().await);
                 for id in before.union(&now).filter(|id| !shown.contains(*id)) {
-                    // What came while the watch began may have come after the snapshot, or gone before it.
+                    // A resource that came while the watch began may have come after the snapshot, or gone before it.
                     if before.contains(id) || !shared.is_there(id).await {
                         shared.vanished(id, "it went while nobody watched").await;
                     }

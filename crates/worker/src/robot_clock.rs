@@ -1,20 +1,20 @@
-//! The robot's time: wall time since a start, times the speed at which the cell runs. Durations in goals, trajectories and
-//! event logs are in it.
+//! Robot time: wall time since a start, multiplied by the speed at which the cell runs. Durations in goals, trajectories and event logs are
+//! robot time.
 
 use ratn_model::time::Timestamp;
 use std::time::{Duration, Instant};
 
-/// A clock of the robot's time.
+/// A clock of robot time.
 #[derive(Debug, Clone, Copy)]
 pub struct RobotClock {
     start: Instant,
-    /// What it was at the start.
+    /// Robot time at the start.
     at: Timestamp,
     speed: f64,
 }
 
 impl RobotClock {
-    /// A clock that is at zero now. `speed`, above 0, is how many of the robot's seconds pass in one second of wall time.
+    /// A clock that is at zero now. `speed`, above 0, is the number of seconds of robot time per second of wall time.
     pub fn start(speed: f64) -> RobotClock {
         RobotClock::going_on(Timestamp(0), speed)
     }
@@ -24,12 +24,12 @@ impl RobotClock {
         RobotClock { start: Instant::now(), at, speed }
     }
 
-    /// The robot's time.
+    /// The present robot time.
     pub fn now(&self) -> Timestamp {
         self.at + self.start.elapsed().mul_f64(self.speed)
     }
 
-    /// How long to wait, in wall time, until a moment of the robot's time; zero when it is past.
+    /// Wall time until a moment of robot time; zero if it is past.
     pub fn until(&self, moment: Timestamp) -> Duration {
         moment.since(self.now()).div_f64(self.speed)
     }

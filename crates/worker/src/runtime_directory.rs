@@ -1,5 +1,5 @@
-//! How the parts of a system on one machine find each other: a directory with one file per role, `<role>.endpoint`, which
-//! holds where that role is served. A file is there exactly while its role is ready.
+//! The runtime directory, by which the processes of a system on one machine find each other: one file per role, `<role>.endpoint`, with the
+//! endpoint at which the role is served. The file exists exactly while the role is ready.
 
 use crate::endpoint::{Endpoint, EndpointError};
 use std::fs;
@@ -8,7 +8,7 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// How often [`RuntimeDirectory::wait_for`] looks.
+/// Interval at which [`RuntimeDirectory::wait_for`] checks.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 /// The bits of a mode that let the group or everybody write.
 const OTHERS_WRITE: u32 = 0o022;
@@ -27,7 +27,7 @@ pub enum FindError {
     NotPublished {
         /// The role.
         role: String,
-        /// The file that it would have.
+        /// The file that would contain its endpoint.
         file: PathBuf,
     },
     /// No process served the role within the deadline.
@@ -35,12 +35,12 @@ pub enum FindError {
     NotInTime {
         /// The role.
         role: String,
-        /// The file that it would have.
+        /// The file that would contain its endpoint.
         file: PathBuf,
         /// How long was waited, in seconds.
         waited_s: f64,
     },
-    /// The file holds something else than an endpoint.
+    /// The file contains something else than an endpoint.
     #[error("{} does not say where the {role} is", file.display())]
     Malformed {
         /// The role.
@@ -56,13 +56,13 @@ pub enum FindError {
     Unreadable {
         /// The file.
         file: PathBuf,
-        /// Why.
+        /// The cause.
         #[source]
         source: io::Error,
     },
 }
 
-/// A role that others can find as long as this lives.
+/// A role that other processes can find as long as this guard lives.
 #[derive(Debug)]
 #[must_use = "the endpoint is withdrawn when this is dropped"]
 pub struct Published {
@@ -71,7 +71,7 @@ pub struct Published {
 }
 
 impl RuntimeDirectory {
-    /// The directory at `path`, made for this user only if it is not there.
+    /// The directory at `path`; if it does not exist, it is made, accessible to this user only.
     ///
     /// # Errors
     /// The directory cannot be made, is no directory, or can be written by other users, who could then pretend to be a role.
@@ -91,25 +91,25 @@ impl RuntimeDirectory {
         RuntimeDirectory { path: path.into() }
     }
 
-    /// Where it is.
+    /// The directory's path.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// The file that says where `role` is.
+    /// The file with the endpoint of `role`.
     pub fn endpoint_file(&self, role: &str) -> PathBuf {
         self.path.join(format!("{role}.endpoint"))
     }
 
-    /// A Unix socket in it, `<name>.sock`; its directory is made with the first bind.
+    /// A Unix socket in the directory, `<name>.sock`; the directory is made with the first bind.
     pub fn socket(&self, name: &str) -> Endpoint {
         Endpoint::Unix(self.path.join(format!("{name}.sock")))
     }
 
-    /// The address that `role` listens on: its socket in this directory, where `listen` is [`Endpoint::local`]; else `listen`.
+    /// The address that `role` listens on: if `listen` is [`Endpoint::local`], its socket in this directory; else `listen`.
     ///
     /// # Errors
-    /// Where the directory is relative and the current one is gone.
+    /// The directory is relative and the current directory is gone.
     pub fn listen(&self, listen: &Endpoint, role: &str) -> io::Result<Endpoint> {
         if !listen.is_local() {
             return Ok(listen.clone());
@@ -117,10 +117,10 @@ impl RuntimeDirectory {
         Ok(Endpoint::Unix(std::path::absolute(self.path.join(format!("{role}.sock")))?))
     }
 
-    /// Lets others find `role` at `endpoint` until the guard is dropped.
+    /// Publishes `endpoint` for `role` until the guard is dropped.
     ///
     /// # Errors
-    /// Where the file cannot be written.
+    /// The file cannot be written.
     pub fn publish(&self, role: &str, endpoint: &Endpoint) -> io::Result<Published> {
         publish_file(&self.endpoint_file(role), endpoint)
     }
@@ -138,19 +138,19 @@ impl RuntimeDirectory {
         }
     }
 
-    /// The endpoint of `role`, as soon as its file is there.
+    /// The endpoint of `role`; waits until its file exists.
     ///
     /// # Errors
-    /// [`FindError`] after `deadline`, or at once where the file is there and holds nonsense.
+    /// [`FindError`] after `deadline`, or at once if the file exists and is malformed.
     pub async fn wait_for(&self, role: &str, deadline: Duration) -> Result<Endpoint, FindError> {
         wait_for_file(&self.endpoint_file(role), role, deadline).await
     }
 }
 
-/// Writes `endpoint` to `file`, so that nobody ever reads half of it; removed when the guard is dropped.
+/// Writes `endpoint` to `file` atomically; the file is removed when the guard is dropped.
 ///
 /// # Errors
-/// Where the file cannot be written.
+/// The file cannot be written.
 pub fn publish_file(file: &Path, endpoint: &Endpoint) -> io::Result<Published> {
     let content = format!("{endpoint}\n");
     let mut name = file.file_name().unwrap_or_default().to_owned();
@@ -163,10 +163,10 @@ pub fn publish_file(file: &Path, endpoint: &Endpoint) -> io::Result<Published> {
     Ok(Published { file: file.to_owned(), content })
 }
 
-/// The endpoint that `file` (of `role`, for the message) comes to hold.
+/// Waits for `file` and reads the endpoint in it; `role` is for the message.
 ///
 /// # Errors
-/// [`FindError`] after `deadline`, or at once where the file is there and holds nonsense.
+/// [`FindError`] after `deadline`, or at once if the file exists and is malformed.
 pub async fn wait_for_file(file: &Path, role: &str, deadline: Duration) -> Result<Endpoint, FindError> {
     let look = async {
         loop {
@@ -195,7 +195,7 @@ fn read_endpoint_file(file: &Path, role: &str) -> Result<Option<Endpoint>, FindE
 
 impl Drop for Published {
     fn drop(&mut self) {
-        // A successor may have published itself in the meantime: then the file is its own.
+        // A successor may have published itself meanwhile: then the file belongs to the successor.
         if fs::read_to_string(&self.file).is_ok_and(|content| content == self.content) {
             let _ = fs::remove_file(&self.file);
         }

@@ -1,8 +1,8 @@
-//! One way to serve: bind, add health and reflection, serve until a token is cancelled, drain with a hard deadline.
+//! The server of every daemon and worker: bind, add health and reflection, serve until a token is cancelled, drain with a hard deadline.
 //!
 //! ```text
-//!   serving ─ token cancelled ─▶ draining ─ no call under way, or the deadline ─▶ connections told to go away ─▶ over
-//!                                NOT_SERVING, new calls: UNAVAILABLE, when to come back
+//!   serving ─ token cancelled ─▶ draining ─ no call under way, or the deadline ─▶ GOAWAY on all connections ─▶ over
+//!                                NOT_SERVING, new calls: UNAVAILABLE with a retry delay
 //! ```
 
 use crate::access::RoleGate;
@@ -34,51 +34,51 @@ use tonic_health::ServingStatus;
 
 /// Calls that have not ended this long after the shutdown began are dropped.
 pub const DRAIN_DEADLINE: Duration = Duration::from_millis(500);
-/// After the last call connections have this long to be closed in order.
+/// Time for connections to close in order after the last call.
 const CLOSE_PATIENCE: Duration = Duration::from_millis(100);
-/// How often a gate looks whether its callers have lost something, also where nobody calls.
+/// Interval at which the gate checks whether callers have lost permissions, even without calls.
 const LOOK_AGAIN: Duration = Duration::from_secs(1);
-/// The metadata of one call has at most this many bytes.
+/// Maximum size of the metadata of one call.
 const MAX_METADATA_BYTES: u32 = 16 * 1024;
 
-/// What a connection may hold of requests that nobody has read yet. It also bounds small messages: h2 closes a connection when the
-/// overhead of small frames that wait is more than half of this (`data_frame_budget` of its server), at 256 bytes a frame. So 4,096
-/// requests may wait on a connection, however small: as many as a stream may have calls under way ([`crate::multiplex`]).
+/// Flow-control window of a connection: maximum size of received requests that no service has read yet. It also bounds small messages: h2
+/// closes a connection when the overhead of waiting small frames exceeds half of this (`data_frame_budget` of its server), at 256 bytes a
+/// frame. So 4,096 requests may wait on a connection, however small: as many as a stream may have calls under way ([`crate::multiplex`]).
 const CONNECTION_WINDOW_BYTES: u32 = 2 * 1024 * 1024;
 
-/// How calls are let in, and how serving ends.
+/// How calls are admitted, and how serving ends.
 #[derive(Clone)]
 pub struct Serving {
-    /// What may be listened on.
+    /// The addresses that may be listened on.
     pub exposure: Exposure,
-    /// Every call passes it; unless said otherwise by roles, of which those of [`crate::access::AccessConfig::default`].
+    /// The gate that every call passes; by default one of roles, with [`crate::access::AccessConfig::default`].
     pub gate: Arc<dyn Gate>,
-    /// How many connections, and how long one may say nothing.
+    /// Limits of connections: their number, and how long they may be idle.
     pub connections: ConnectionLimits,
-    /// Instead of [`DRAIN_DEADLINE`]. With none at all every connection is closed at once, as is right for who only refuses.
+    /// Replaces [`DRAIN_DEADLINE`]. With zero every connection is closed at once, which is right for a server that only refuses.
     pub drain: Duration,
-    /// Says how far it is.
+    /// The phase of the server.
     pub phase: watch::Sender<Phase>,
-    /// How what is served is, as it says itself.
+    /// The condition of the core behind the services, as it reports it.
     pub vitals: Vitals,
 }
 
-/// How far a server is.
+/// The phase of a server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Phase {
-    /// Nobody is served yet.
+    /// Not serving yet.
     Starting,
-    /// Everybody is refused: another process leads, and this one takes its place when it is gone.
+    /// Every call is refused: another process leads, and this one takes over when that one is gone.
     StandingBy,
-    /// Everybody is.
+    /// Calls are served.
     Serving,
-    /// Only what is under way.
+    /// Only calls under way are served.
     Draining,
-    /// No call is under way any more. Connections are closed; what was served may be given to a successor.
+    /// No call is under way any more. Connections are closed; a successor may take over what was served.
     Drained,
 }
 
-/// A listener that nobody is served on yet.
+/// A listener that does not serve yet.
 #[derive(Debug)]
 pub struct Bound {
     listener: Listener,
@@ -89,11 +89,11 @@ pub struct Bound {
 #[derive(Debug)]
 enum Listener {
     Tcp(TcpListener),
-    /// The file is somebody else's to remove where there is none.
+    /// The socket, and its file unless another process has to remove it.
     Unix(UnixListener, Option<SocketFile>),
 }
 
-/// Removes the socket's file in the end, unless a successor has put its own there.
+/// Removes the socket's file when dropped, unless a successor has put its own there.
 #[derive(Debug)]
 struct SocketFile {
     path: PathBuf,
@@ -101,31 +101,31 @@ struct SocketFile {
     identity: (u64, u64),
 }
 
-/// An address that cannot be listened on.
+/// Why an address cannot be listened on.
 #[derive(Debug, thiserror::Error)]
 pub enum BindError {
-    /// The system does not give it.
+    /// The system refuses it.
     #[error("cannot listen on {endpoint}")]
     Refused {
-        /// Which.
+        /// The endpoint.
         endpoint: Endpoint,
-        /// Why.
+        /// The cause.
         #[source]
         source: io::Error,
     },
-    /// Other machines could reach it, and nothing would say who they are.
+    /// Other machines could reach it, and callers would not be identified.
     #[error(
         "{endpoint} can be reached from other machines and has no TLS: give `[service.tls]` in the config, listen on a Unix \
          socket or on loopback, or say --insecure where the network itself is trusted"
     )]
     Exposed {
-        /// Which.
+        /// The endpoint.
         endpoint: Endpoint,
     },
     /// `https` without a certificate.
     #[error("{endpoint} is to be served with TLS, and no certificate is given")]
     NoCertificate {
-        /// Which.
+        /// The endpoint.
         endpoint: Endpoint,
     },
     /// A TLS file cannot be read, or holds nothing usable.
@@ -134,45 +134,45 @@ pub enum BindError {
 }
 
 impl BindError {
-    /// Whether somebody else listens there.
+    /// Whether another process listens there.
     pub fn is_taken(&self) -> bool {
         matches!(self, BindError::Refused { source, .. } if source.kind() == io::ErrorKind::AddrInUse)
     }
 }
 
-/// What a server may listen on.
+/// The addresses that a server may listen on.
 #[derive(Debug, Clone, Default)]
 pub struct Exposure {
-    /// With it every TCP address is served with TLS.
+    /// If set, every TCP address is served with TLS.
     pub tls: Option<LiveServerTls>,
-    /// Without TLS, addresses beyond loopback are served all the same.
+    /// Allows addresses beyond loopback without TLS.
     pub insecure: bool,
     /// Who may connect to a Unix socket.
     pub socket: SocketAccess,
 }
 
-/// Serving ended before its time.
+/// Why serving ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
     /// The transport failed.
     #[error("serving on {endpoint} failed")]
     Transport {
-        /// Where.
+        /// The endpoint.
         endpoint: Endpoint,
-        /// Why.
+        /// The cause.
         #[source]
         source: tonic::transport::Error,
     },
-    /// Nothing can be accepted.
+    /// No connections can be accepted.
     #[error("cannot accept connections on {endpoint}")]
     Accept {
-        /// Where.
+        /// The endpoint.
         endpoint: Endpoint,
-        /// Why.
+        /// The cause.
         #[source]
         source: io::Error,
     },
-    /// What is served has ended before its time.
+    /// The core behind the services has ended.
     #[error(transparent)]
     Core(#[from] CoreFailure),
     /// The descriptors do not make a reflection service.
@@ -180,7 +180,7 @@ pub enum ServeError {
     Reflection(#[source] tonic_reflection::server::Error),
 }
 
-/// What is served. A service sets its own message limits (`max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)`).
+/// The services of a server. A service sets its own message limits (`max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)`).
 #[derive(Debug, Clone, Default)]
 pub struct Services {
     routes: Routes,
@@ -188,12 +188,12 @@ pub struct Services {
 }
 
 impl Services {
-    /// Nothing yet.
+    /// Without any service.
     pub fn new() -> Services {
         Services::default()
     }
 
-    /// With one more service, as tonic generates them.
+    /// Adds a service, as generated by tonic.
     #[must_use]
     pub fn with<S>(mut self, service: S) -> Services
     where
@@ -211,18 +211,18 @@ impl Services {
     }
 }
 
-/// Binds `listen`; what is bound has the real port. A Unix socket that nobody listens on any more is replaced.
+/// Binds `listen`; the result has the real port. A Unix socket that no process listens on any more is replaced.
 ///
 /// # Errors
-/// [`BindError`] where the address cannot be had, or is beyond loopback.
+/// [`BindError`] if the address is not available, or is beyond loopback.
 pub async fn bind(listen: &Endpoint) -> Result<Bound, BindError> {
     bind_as(listen, &Exposure::default()).await
 }
 
-/// As [`bind`], with TLS or where other machines reach it.
+/// As [`bind`], with TLS or for addresses that other machines can reach.
 ///
 /// # Errors
-/// [`BindError`] where the address cannot be had, or may not be as `exposure` is.
+/// [`BindError`] if the address is not available, or `exposure` does not allow it.
 pub async fn bind_as(listen: &Endpoint, exposure: &Exposure) -> Result<Bound, BindError> {
     let failed = |source| BindError::Refused { endpoint: listen.clone(), source };
     match listen {
@@ -274,10 +274,10 @@ impl Default for Serving {
 }
 
 impl Bound {
-    /// The same listener once more, for who serves before the one who is to serve.
+    /// A second handle of the same listener, for a process that serves before the real service does.
     ///
     /// # Errors
-    /// Where the system refuses.
+    /// The system refuses.
     pub fn again(&self) -> io::Result<Bound> {
         let listener = match &self.listener {
             Listener::Tcp(listener) => {
@@ -292,26 +292,27 @@ impl Bound {
         Ok(Bound { listener, endpoint: self.endpoint.clone(), tls: self.tls.clone() })
     }
 
-    /// Where it is to be reached.
+    /// The endpoint at which the server can be reached.
     pub fn endpoint(&self) -> &Endpoint {
         &self.endpoint
     }
 
     /// Serves until `shutdown` is cancelled, then lets calls under way end within [`DRAIN_DEADLINE`] and refuses new ones with
-    /// [`crate::gate::ending`]. Health is SERVING from the first answer on, for the server (the empty name) and for each service,
-    /// and NOT_SERVING while what is served says that it cannot do what it is for ([`Vitals`]), and once it drains. Services must end endless streams, and calls that wait for something, on the same token.
+    /// [`crate::gate::ending`]. Health is SERVING from the first answer on, for the server (the empty name) and for each service; it is
+    /// NOT_SERVING while the core reports that it cannot do its work ([`Vitals`]), and during the drain. Services must end endless streams,
+    /// and calls that wait for something, on the same token.
     ///
     /// # Errors
-    /// [`ServeError`] where the transport fails.
+    /// [`ServeError`] if the transport fails.
     pub async fn serve(self, services: Services, shutdown: CancellationToken) -> Result<(), ServeError> {
         self.serve_as(services, Serving::default(), shutdown).await
     }
 
-    /// As [`Bound::serve`], through a gate and with a drain of one's own.
+    /// As [`Bound::serve`], with these settings.
     ///
     /// # Errors
-    /// [`ServeError`] where the transport fails, or what is served has ended before its time: then
-    /// nothing more is answered, and nothing drains.
+    /// [`ServeError`] if the transport fails, or the core behind the services has ended: then no call is answered any more, and there is no
+    /// drain.
     pub async fn serve_as(
         self,
         services: Services,
@@ -352,7 +353,7 @@ impl Bound {
         let cannot_accept = |source| ServeError::Accept { endpoint: endpoint.clone(), source };
         let served = {
             let stop = closing.clone().cancelled_owned();
-            // On the heap: it is large, and within the future of every daemon.
+            // Boxed, because it is large and part of the future of every daemon.
             match self.listener {
                 Listener::Tcp(listener) => {
                     let speaks = self.tls.is_none();
@@ -374,7 +375,7 @@ impl Bound {
                     let incoming = incoming.filter_map(move |accepted| {
                         take_in(accepted).map(|taken| taken.map(Connection::at_a_path)).transpose()
                     });
-                    // Removed while it is still listened on: afterwards the file may be a successor's.
+                    // The file is removed before listening stops: afterwards it could be a successor's.
                     let stop = async {
                         stop.await;
                         drop(file);
@@ -403,7 +404,7 @@ impl Bound {
             }
             serving.phase.send_replace(Phase::Drained);
             closing.cancel();
-            // Who watches health would keep a connection open for ever.
+            // A client that watches health would keep its connection open for ever.
             tokio::time::sleep(CLOSE_PATIENCE.min(serving.drain)).await;
             connections.close_all();
         };
@@ -419,7 +420,7 @@ impl Bound {
     }
 }
 
-/// A connection with its place among those of the server; nothing where there is none.
+/// Registers an accepted connection; `None` if there are too many.
 fn take_in<S: Goodbye>(
     connections: &Connections,
     gate: &dyn Gate,
@@ -439,7 +440,7 @@ fn take_in<S: Goodbye>(
     }
 }
 
-/// Tells the gate to look again, for as long as it is polled.
+/// Makes the gate check its roles regularly, for as long as it is polled.
 async fn look_again(gate: &dyn Gate) -> Infallible {
     let mut interval = tokio::time::interval(LOOK_AGAIN);
     loop {
@@ -448,7 +449,7 @@ async fn look_again(gate: &dyn Gate) -> Infallible {
     }
 }
 
-/// Whether a killed process left this socket behind.
+/// Whether the socket was left behind by a killed process.
 async fn is_dead_socket(path: &Path) -> bool {
     let is_socket = std::fs::symlink_metadata(path).is_ok_and(|is| is.file_type().is_socket());
     let refused = |error: io::Error| error.kind() == io::ErrorKind::ConnectionRefused;

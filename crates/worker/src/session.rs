@@ -1,13 +1,13 @@
-//! A session with the resource manager: kept alive in the background, continued after a broken connection, opened again
-//! when the manager has forgotten it. What it owned is then gone; [`SessionState::generation`] tells, by the number that the manager gives
-//! every session that it makes: also where the answer that said `created` was lost with its connection.
+//! A session with the resource manager: kept alive in the background, continued after a broken connection, made again when the manager has
+//! forgotten it. Then everything that the session owned is gone, and [`SessionState::generation`] grows. The client notices that by the
+//! number that the manager gives each session that it makes, even if the answer that said `created` was lost with its connection.
 //!
 //! ```text
 //! open ─→ not alive ─ ping answered ─→ alive ─ no answer for a TTL ─→ not alive
-//!                                      └─ answer says `created`, or another number ─→ alive, next generation
-//! not alive ─ answer says that it is known ─→ alive, the same generation: a manager that was suspended, or away, has kept it
+//!                                      └─ answer: `created`, or another number ─→ alive, next generation
+//! not alive ─ answer: known ─→ alive, the same generation: a manager that was suspended, or away, has kept it
 //! ```
-//! A session whose id is another caller's does not come back ([`Session::taken`]): its client goes on with a session of another id.
+//! A session whose id belongs to another caller does not come back ([`Session::taken`]): its client has to use a session of another id.
 
 use crate::boot_clock::{BootClock, BootInstant};
 use crate::client::{Channels, fresh_id};
@@ -27,23 +27,23 @@ use tokio_util::sync::CancellationToken;
 use tonic::Status;
 use tonic_types::StatusExt;
 
-/// How long a session lives without a ping, where the client does not choose a time.
+/// Default time to live: how long a session lives without a ping.
 pub const DEFAULT_TTL: Duration = Duration::from_secs(3);
 
-/// A manager that is not heard for so many times to live, after the first, is not waited for any more.
+/// A manager that is not heard for this many further times to live, after the first, is given up.
 pub const GIVEN_UP_AFTER: u32 = 3;
 /// A session is pinged this many times per time to live.
 const PINGS_PER_TTL: u32 = 4;
-/// The pause before a reconnect; grows from the first to the second.
+/// Pause before a reconnect; it grows from the first value to the second.
 const BACKOFF: (Duration, Duration) = (Duration::from_millis(20), Duration::from_millis(500));
-/// The reason of a refusal to speak for a session of another caller.
+/// The reason code of a refusal because the session belongs to another caller.
 const NOT_YOURS: &str = "NOT_YOURS";
-/// So soon after the time to live of an answer the rest of what it says is known, too.
+/// Delay after an answer until the rest of the answer's content is known, too.
 const MOMENT: Duration = Duration::from_millis(5);
-/// The last ping, which ends the session, is given this long.
+/// Time limit for the last ping, which ends the session.
 const FAREWELL: Duration = Duration::from_millis(200);
 
-/// A session that is kept alive until this is closed or dropped.
+/// A session that is kept alive until this handle is closed or dropped.
 #[derive(Debug)]
 pub struct Session {
     id: String,
@@ -55,12 +55,12 @@ pub struct Session {
     task: Option<JoinHandle<()>>,
 }
 
-/// What the client of a session is beside others that want the same.
+/// The standing of a session's client among others that want the same resources.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Standing {
-    /// How much of it the client is to have, beside the shares of the others: from 0.01 to 100, and 1 as usual.
+    /// The client's share, relative to the shares of others: from 0.01 to 100, usually 1.
     pub share: f64,
-    /// When its task is due, if it is.
+    /// The deadline of its task, if any.
     pub due: Option<SystemTime>,
 }
 
@@ -71,10 +71,10 @@ impl Default for Standing {
 }
 
 impl Standing {
-    /// The shares that there are.
+    /// The allowed shares.
     pub const SHARES: RangeInclusive<f64> = 0.01..=100.0;
 
-    /// How many milliseconds are left until its task is due; negative where that has passed.
+    /// Milliseconds until the deadline of its task; negative if it has passed.
     pub fn due_in_ms(&self, now: SystemTime) -> Option<i64> {
         let whole = |time: Duration| i64::try_from(time.as_millis()).unwrap_or(i64::MAX);
         self.due.map(|due| due.duration_since(now).map_or_else(|passed| -whole(passed.duration()), whole))
@@ -88,18 +88,19 @@ pub struct SessionState {
     pub alive: bool,
     /// How often the manager has made the session. When it grows, everything that the session owned and held is gone.
     pub generation: u64,
-    /// When the session was found to have expired on this side; `None` while it is alive, or was never alive.
+    /// When this client found the session to have expired; `None` while the session is alive, or was never alive.
     pub unheard_since: Option<Instant>,
-    /// The manager knew it from before when it was pinged for the first time: it goes on with what it has there.
+    /// The manager already knew the session at the first ping: the session goes on with what it has there.
     pub found: bool,
-    /// Its number at the manager: one that is made anew under the same id has another. 0 until it was alive, and where the manager does not
-    /// number its sessions.
+    /// The session's number at the manager: a session that is made again under the same id has another one. 0 before the session was alive,
+    /// and if the manager does not number its sessions.
     pub number: u64,
-    /// The manager has said last that the id is another caller's, who has a session of it or had the last one ([`Session::taken`]).
+    /// The manager's last answer was that the id belongs to another caller, who has a session of that id or had the last one
+    /// ([`Session::taken`]).
     pub taken: bool,
 }
 
-/// Until when a client believes in its session: from its last answered ping on for its time to live, the time included in which the
+/// Until when a client believes that its session lives: the time to live counted from the last answered ping, including time in which the
 /// machine was suspended. A handle: clones share everything.
 #[derive(Debug, Clone)]
 pub(crate) struct Belief {
@@ -113,7 +114,7 @@ pub(crate) struct Belief {
 pub struct SessionError {
     /// The resource manager's endpoint.
     pub endpoint: Endpoint,
-    /// The session's id, where it belongs to another caller.
+    /// The session's id, if it belongs to another caller.
     pub taken: Option<String>,
     /// The deadline, in seconds.
     pub waited_s: f64,
@@ -131,19 +132,19 @@ impl SessionError {
 }
 
 impl Session {
-    /// Opens a session with the resource manager at `endpoint` and keeps it alive. `client` is a name for people, `ttl` the time after which
-    /// the manager ends a session that it does not hear of. Returns at once; [`Session::alive`] waits.
+    /// Opens a session with the resource manager at `endpoint` and keeps it alive. `client` is a name for people, `ttl` the time to live:
+    /// without a ping for so long, the manager ends the session. Returns at once; [`Session::alive`] waits.
     pub fn open(channels: &Channels, endpoint: &Endpoint, client: &str, ttl: Duration) -> Session {
         Session::open_as(channels, endpoint, fresh_id(client), client, ttl)
     }
 
-    /// As [`Session::open`], with an id of the caller's choice. With the id of a session whose client is gone, that session goes on if it
-    /// still lives. No other caller may use the id.
+    /// As [`Session::open`], with an id of the caller's choice. If the client of a session with this id is gone and the session still
+    /// lives, it goes on. No other caller may use the id.
     pub fn open_as(channels: &Channels, endpoint: &Endpoint, id: String, client: &str, ttl: Duration) -> Session {
         Session::open_by(BootClock::default(), channels, endpoint, id, client, ttl)
     }
 
-    /// As [`Session::open_as`], of a client that says what it is beside others.
+    /// As [`Session::open_as`], with the client's standing among others.
     pub fn open_beside(
         channels: &Channels,
         endpoint: &Endpoint,
@@ -155,7 +156,7 @@ impl Session {
         Session::keep(BootClock::default(), channels, endpoint, (id, standing), client, ttl)
     }
 
-    /// As [`Session::open_as`], measured by this clock.
+    /// As [`Session::open_as`], with this clock.
     pub fn open_by(
         clock: BootClock,
         channels: &Channels,
@@ -211,10 +212,10 @@ impl Session {
         self.belief.clone()
     }
 
-    /// Returns once the session is alive.
+    /// Returns when the session is alive.
     ///
     /// # Errors
-    /// [`SessionError`] when it is not alive within `deadline`.
+    /// [`SessionError`] if it is not alive within `deadline`.
     pub async fn alive(&self, deadline: Duration) -> Result<(), SessionError> {
         let mut state = self.state.clone();
         let alive = timeout(deadline, state.wait_for(|state| state.alive)).await;
@@ -225,9 +226,9 @@ impl Session {
         Err(SessionError { endpoint: self.endpoint.clone(), taken, waited_s: deadline.as_secs_f64() })
     }
 
-    /// Returns once everything that the session owned or held may belong to somebody else: the manager has not answered for the time to
-    /// live, or has made the session anew since the call. A session that was never alive is waited for first. For a client that has to stop
-    /// then; the manager may still know the session ([`Session::gone`]).
+    /// Returns when everything that the session owned or held may belong to another client: the manager has not answered for the time to
+    /// live, or has made the session again since the call. A session that was never alive is waited for first. For a client that has to
+    /// stop then; the manager may still know the session ([`Session::gone`]).
     pub async fn lost(&self) {
         let mut state = self.state.clone();
         if state.borrow().unheard_since.is_some() {
@@ -237,24 +238,25 @@ impl Session {
         let _ = state.wait_for(|s| !s.alive || s.generation != generation).await;
     }
 
-    /// Returns once everything that the session owned or held is gone for good: the manager has made the session anew, or has not answered
+    /// Returns when everything that the session owned or held is gone for good: the manager has made the session again, or has not answered
     /// for [`GIVEN_UP_AFTER`] further times to live after the session had expired here. Counts from the session's beginning.
     pub async fn gone(&self) {
         gone(self.state.clone(), self.ttl).await;
     }
 
-    /// A handle that says whether the session still has what it had: for a task of its own that does what only the holder of its leases may do.
+    /// A handle that tells whether the session still has what it had: for a separate task that does what only the holder of its leases may
+    /// do.
     pub fn trust(&self) -> Trust {
         Trust { state: self.state.clone(), belief: self.belief.clone(), ttl: self.ttl }
     }
 
-    /// Returns once the manager says that the session's id belongs to another caller. Everything that the session owned or held is gone, or
-    /// ends with its time to live, and asking again does not help. For a client that can go on with a session of another id. A client that
-    /// provides something must not take it for standing still: start its provider anew
+    /// Returns when the manager says that the session's id belongs to another caller. Everything that the session owned or held is gone, or
+    /// ends with its time to live, and a retry does not help. For a client that can go on with a session of another id. A client that
+    /// provides resources must not conclude that they stand still: it has to start its provider anew
     /// ([`crate::provider::Provider::start_at_rest`]).
     pub async fn taken(&self) {
         if self.state.clone().wait_for(|state| state.taken).await.is_err() {
-            // It has been closed.
+            // The session has been closed.
             std::future::pending().await
         }
     }
@@ -274,7 +276,7 @@ impl Session {
         }
     }
 
-    /// Stops pinging, without telling the manager: the session keeps what it owns and holds until its time to live is over.
+    /// Stops pinging without telling the manager: the session keeps what it owns and holds until its time to live has passed.
     pub async fn abandon(mut self) {
         if let Some(task) = self.task.take() {
             task.abort();
@@ -291,7 +293,7 @@ impl Session {
     }
 }
 
-/// Whether a session has what it had. Clones share everything.
+/// Tells whether a session still has what it had. Clones share everything.
 #[derive(Debug, Clone)]
 pub struct Trust {
     state: watch::Receiver<SessionState>,
@@ -300,12 +302,12 @@ pub struct Trust {
 }
 
 impl Trust {
-    /// Whether everything that the session owned and held is its own still. While that is not known (the manager is not heard, or this process
-    /// was suspended) it waits until it is; what is gone is gone as [`Session::gone`] says.
+    /// Whether everything that the session owned and held is still its own. While that is unknown (the manager is not heard, or this
+    /// process was suspended), it waits. What counts as gone is defined at [`Session::gone`].
     pub async fn is_kept(&mut self) -> bool {
         while !self.belief.holds() {
             tokio::select! {
-                // What the answer says of the session is told a moment after it.
+                // The session's state follows a moment after the answer.
                 changed = self.belief.until.changed() => match changed {
                     Ok(()) => tokio::time::sleep(MOMENT).await,
                     Err(_) => return false,
@@ -316,7 +318,7 @@ impl Trust {
         self.state.borrow().generation <= 1
     }
 
-    /// Returns once it is gone for good, as [`Session::gone`] does.
+    /// Returns when everything is gone for good, as [`Session::gone`] does.
     pub async fn gone(&self) {
         gone(self.state.clone(), self.ttl).await;
     }
@@ -345,12 +347,13 @@ async fn gone(mut state: watch::Receiver<SessionState>, ttl: Duration) {
 }
 
 impl Belief {
-    /// Whether the session is believed in now. For those that cannot wait for a timer, which stands still while the machine is suspended.
+    /// Whether the session is believed to live now. For code that cannot rely on a timer, which stands still while the machine is
+    /// suspended.
     pub(crate) fn holds(&self) -> bool {
         self.clock.now() < *self.until.borrow()
     }
 
-    /// Returns this long before it ends, unless it is renewed before.
+    /// Returns `margin` before the belief ends, unless it is renewed before.
     async fn nearly_ended(mut self, margin: Duration) {
         loop {
             let at = self.until.borrow_and_update().saturating_sub(margin);
@@ -365,7 +368,7 @@ impl Belief {
 
 impl Drop for Session {
     fn drop(&mut self) {
-        // The task says farewell, if the runtime still lets it.
+        // The task sends the last ping, if the runtime still lets it.
         self.end.cancel();
     }
 }
@@ -381,7 +384,7 @@ struct SessionTask {
     expires: watch::Sender<BootInstant>,
     tell: watch::Sender<SessionState>,
     end: CancellationToken,
-    /// Which session of the manager's this is, as its last answer said.
+    /// The session's number at the manager, from its last answer.
     number: Option<u64>,
 }
 
@@ -393,7 +396,7 @@ impl SessionTask {
             let (end, mut state) = (self.end.clone(), self.tell.subscribe());
             let belief = Belief { until: self.expires.subscribe(), clock: self.clock.clone() };
             let ran_out = async {
-                // Once it is alive; the sender is in this task.
+                // Counts only once the session is alive; the sender is in this task.
                 let _ = state.wait_for(|state| state.alive).await;
                 belief.clone().nearly_ended(Duration::ZERO).await;
             };
@@ -418,17 +421,17 @@ impl SessionTask {
             tokio::select! {
                 biased;
                 () = end.cancelled() => break,
-                // It is said in time that the session is over.
+                // The pause is bounded, so that the end of the session is reported in time.
                 () = tokio::time::sleep(backoff.min(self.patience())) => {}
             }
             backoff = (backoff * 2).min(BACKOFF.1);
         }
-        // The stream with its pings is gone; a last one says that the session shall end now.
+        // The stream of pings is gone; a last ping tells the manager to end the session now.
         let _ = timeout(FAREWELL, self.farewell()).await;
         self.tell.send_if_modified(|state| std::mem::take(&mut state.alive));
     }
 
-    /// Pings over one stream until it breaks.
+    /// Pings over one stream until the stream breaks.
     async fn stream(&mut self) {
         let Some(mut client) = self.connect() else { return };
         let (pings, outgoing) = mpsc::channel(1);
@@ -449,15 +452,15 @@ impl SessionTask {
                 Ok(Ok(None)) | Err(_) => return,
             };
             let ttl = Duration::from_millis(answer.ttl_ms);
-            // Counted from the question, so that it never lives longer here than there.
+            // Counted from the question, so that the session never lives longer here than at the manager.
             self.expires.send_replace(asked + ttl);
-            // A manager that does not number its sessions says 0 of each.
-            // An answer that was read long after its question, as after a suspension of the machine, promises nothing any more.
+            // A manager that does not number its sessions answers 0. An answer that is read long after its question, as after a suspension
+            // of the machine, no longer keeps the session alive.
             let holds = self.clock.now() < asked + ttl;
             let is_another = self.number.replace(answer.number).is_some_and(|before| before != answer.number);
             self.tell.send_if_modified(|state| {
                 let before = *state;
-                // One that was not alive here was not there: the answer that said so may have been lost with its stream.
+                // A session that was not alive here did not exist before: the answer that said so may have been lost with its stream.
                 state.found |= before.generation == 0 && !answer.created;
                 state.number = answer.number;
                 state.generation += u64::from(answer.created || is_another || before.generation == 0);
@@ -470,7 +473,7 @@ impl SessionTask {
             });
             tokio::select! {
                 () = tokio::time::sleep(ttl.min(self.ttl) / PINGS_PER_TTL) => {}
-                // Nothing is due: the stream broke, or the manager ended it.
+                // No answer is due: the stream broke, or the manager ended it.
                 _ = answers.message() => return,
             }
             panic_point("session");
@@ -515,7 +518,7 @@ impl SessionTask {
         }
     }
 
-    /// How long an answer may take: until the session is over, once it is, a time to live.
+    /// Time limit for an answer: until the session expires; after that, the time to live.
     fn patience(&self) -> Duration {
         let left = self.expires.borrow().saturating_duration_since(self.clock.now());
         if left.is_zero() { self.ttl } else { left }

@@ -1,5 +1,5 @@
-//! When a process ends: a signal, or the end of its parent. Both only cancel a token; the server drains by it. What does
-//! not drain in time is ended hard, so that nothing outlives its parent.
+//! Ends a process after a signal, or after the end of its parent. Both only cancel a token, at which the server drains. A process that does
+//! not drain in time is ended hard, so that none outlives its parent.
 
 use crate::adoption::Adoption;
 use crate::panic::{exit_on_panic, exit_on_panic_blocking};
@@ -8,17 +8,17 @@ use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
-/// After its parent's end a process lives at most this much longer.
+/// Maximum time that a process lives after its parent's end.
 pub const EXIT_GRACE: Duration = Duration::from_millis(900);
 /// The exit code of a process that did not drain in time after a signal or its parent's end.
 const EXIT_CODE_OVERDUE: i32 = 3;
 /// The exit code after a second signal: 128 + SIGINT.
 const EXIT_CODE_INTERRUPTED: i32 = 130;
 
-/// Cancels `token` at SIGTERM or SIGINT; a second one ends the process at once. Needs a tokio runtime.
+/// Cancels `token` at SIGTERM or SIGINT; a second signal ends the process at once. Needs a tokio runtime.
 ///
 /// # Errors
-/// Where the signals cannot be caught.
+/// The signals cannot be caught.
 pub fn on_signals(token: &CancellationToken) -> io::Result<()> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
     let token = token.clone();
@@ -33,11 +33,11 @@ pub fn on_signals(token: &CancellationToken) -> io::Result<()> {
     Ok(())
 }
 
-/// As [`on_signals`], for a process that drains: what has not ended `patience` after the first signal is ended all the same. In a
-/// thread of its own, so that a runtime that hangs (a disk that does not answer) cannot keep the process.
+/// As [`on_signals`], for a process that drains: `patience` after the first signal the process is ended in any case. This runs in a thread
+/// of its own, so that a runtime that hangs (a disk that does not answer) cannot prevent it.
 ///
 /// # Errors
-/// Where the signals cannot be caught or the thread cannot be started.
+/// The signals cannot be caught, or the thread cannot be started.
 pub fn on_signals_within(token: &CancellationToken, patience: Duration) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let entered = runtime.enter();
@@ -62,12 +62,12 @@ pub fn on_signals_within(token: &CancellationToken, patience: Duration) -> io::R
     Ok(())
 }
 
-/// Watches standard input, a pipe that the parent holds open, in a thread of its own (a busy runtime cannot starve it);
-/// when it ends, cancels `token` and, [`EXIT_GRACE`] later, the process. One that is to be adopted ([`crate::adoption`]) waits for a
-/// successor of its parent first.
+/// Watches standard input, a pipe that the parent holds open, in a thread of its own (a busy runtime cannot starve it). When the pipe is
+/// closed, cancels `token` and, [`EXIT_GRACE`] later, ends the process. A process that may be adopted ([`crate::adoption`]) first waits for
+/// a successor of its parent.
 ///
 /// # Errors
-/// Where the thread cannot be started, or no successor could find it.
+/// The thread cannot be started, or the socket for a successor cannot be made.
 pub fn exit_with_parent(token: &CancellationToken) -> io::Result<()> {
     let token = token.clone();
     let adoption = Adoption::from_environment()?;

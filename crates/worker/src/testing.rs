@@ -1,4 +1,4 @@
-//! For tests of a worker: an action performs one goal over a real socket, without a system.
+//! For tests of a worker: performs one goal of an action over a real socket, without a system.
 
 use crate::action::{Action, ActionServer, Goal, GoalOutcome};
 use crate::client::{ActionClient, Channels, chain};

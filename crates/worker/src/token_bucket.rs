@@ -1,8 +1,8 @@
-//! A token bucket: how often something may happen, and how much of it at once.
+//! A token bucket: limits the rate of events, and the size of a burst.
 
 use std::time::Instant;
 
-/// What may be taken at once, refilled with time.
+/// The tokens, which are refilled with time.
 #[derive(Debug, Clone, Copy)]
 pub struct TokenBucket {
     left: f64,
@@ -10,12 +10,12 @@ pub struct TokenBucket {
 }
 
 impl TokenBucket {
-    /// As many as may come at once.
+    /// A full bucket of `most` tokens.
     pub fn full(most: u32, now: Instant) -> TokenBucket {
         TokenBucket { left: f64::from(most), refilled: now }
     }
 
-    /// One of them, if there is one; `per_s` come back in a second, up to `most`.
+    /// Takes a token, if there is one; `per_s` tokens are refilled per second, up to `most`.
     pub fn take(&mut self, per_s: u32, most: u32, now: Instant) -> bool {
         self.left = self.level(per_s, most, now);
         self.refilled = now;
@@ -26,7 +26,7 @@ impl TokenBucket {
         taken
     }
 
-    /// Whether nothing is taken of it any more.
+    /// Whether the bucket is full again.
     pub fn is_full(&self, per_s: u32, most: u32, now: Instant) -> bool {
         self.level(per_s, most, now) >= f64::from(most)
     }

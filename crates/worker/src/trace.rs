@@ -1,10 +1,10 @@
-//! W3C trace context (www.w3.org/TR/trace-context, level 1): taken from the metadata of a call, put into those made for it.
+//! W3C trace context (www.w3.org/TR/trace-context, level 1): taken from the metadata of a call, and added to the calls made for it.
 //!
 //! ```text
 //!   traceparent: 00-<trace id, 32 hex digits>-<span id of the caller, 16>-<flags, 2>
 //! ```
-//! A task's context ([`within`]) goes into every call that it makes over [`crate::client::Channels`]; the span of the answering side is a
-//! child of it. The ids are in the logs, and where the process sends its spans ([`ratn_otlp::sender`]), each answer is one ([`answering`]).
+//! A task's context ([`within`]) goes into every call that the task makes over [`crate::client::Channels`]; the span of the answering side
+//! is a child of it. The ids are in the logs. If the process exports spans ([`ratn_otlp::sender`]), each answer is one ([`answering`]).
 
 use crate::protocol;
 use rand::RngExt;
@@ -22,10 +22,10 @@ use tonic::transport::Channel;
 /// The header and metadata key.
 pub const HEADER: &str = "traceparent";
 
-/// Whoever began the trace wants its spans to be kept.
+/// The flag with which the originator of the trace asks for its spans to be recorded.
 const SAMPLED: u8 = 1;
 
-/// A place in a trace.
+/// A position in a trace: trace id, span id and flags.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TraceContext {
     trace: u128,
@@ -49,39 +49,39 @@ impl TraceContext {
         TraceContext { trace: random.random::<u128>().max(1), span: random.random::<u64>().max(1), flags: SAMPLED }
     }
 
-    /// A place in a trace whose ids are known; neither is 0.
+    /// A context with these ids; neither may be 0.
     pub fn of(trace: u128, span: u64) -> TraceContext {
         TraceContext { trace: trace.max(1), span: span.max(1), flags: SAMPLED }
     }
 
-    /// A span of the same trace whose id is known.
+    /// A context of the same trace with this span id.
     #[must_use]
     pub fn at(self, span: u64) -> TraceContext {
         TraceContext { span: span.max(1), ..self }
     }
 
-    /// Another span of the same trace.
+    /// A new span of the same trace.
     #[must_use]
     pub fn child(self) -> TraceContext {
         TraceContext { span: rand::rng().random::<u64>().max(1), ..self }
     }
 
-    /// That of a request, if it carries one; one that is none is as good as absent, as the standard wants it.
+    /// The context in a request's headers, if any; a malformed one counts as absent, as the standard demands.
     pub fn from_headers(headers: &http::HeaderMap) -> Option<TraceContext> {
         headers.get(HEADER)?.to_str().ok()?.parse().ok()
     }
 
-    /// What shows it in the logs of what is done for a call.
+    /// A tracing span that adds the ids to the log lines of what is done for a call.
     pub fn entered(self) -> tracing::Span {
         tracing::info_span!("call", trace = %self.trace_id(), span = %self.span_id())
     }
 
-    /// Names the whole trace: 32 hex digits.
+    /// The trace id: 32 hex digits.
     pub fn trace_id(self) -> impl fmt::Display {
         Hex(self.trace, 32)
     }
 
-    /// Names this place in it: 16 hex digits.
+    /// The span id: 16 hex digits.
     pub fn span_id(self) -> impl fmt::Display {
         Hex(self.span.into(), 16)
     }
@@ -103,7 +103,7 @@ impl FromStr for TraceContext {
             parts.next().filter(|part| part.len() == length && lower_hex(part)).ok_or(TraceContextError)
         };
         let (version, trace, span, flags) = (part(2)?, part(32)?, part(16)?, part(2)?);
-        // Later versions may append parts; this one may not.
+        // Later versions of the format may append parts; version 00 may not.
         if version == "ff" || (version == "00" && parts.next().is_some()) {
             return Err(TraceContextError);
         }
@@ -124,12 +124,12 @@ impl fmt::Display for Hex {
     }
 }
 
-/// A channel whose calls carry the context of the task that makes them, and the protocol of this program.
+/// A channel whose calls carry the trace context of the task that makes them, and the protocol version of this program.
 #[derive(Debug, Clone)]
 pub struct Traced(Channel);
 
 impl Traced {
-    /// Over this channel.
+    /// Wraps this channel.
     pub fn new(channel: Channel) -> Traced {
         Traced(channel)
     }
@@ -159,7 +159,7 @@ impl Service<http::Request<Body>> for Traced {
     }
 }
 
-/// The answer to a call, a span once it is dropped.
+/// An answer under way; its span is recorded when this is dropped.
 #[derive(Debug)]
 pub struct Answering {
     sender: &'static Sender,
@@ -170,8 +170,8 @@ pub struct Answering {
     code: Option<Code>,
 }
 
-/// An answer begins to a call of this path, `own` being its place in the trace and `caller` that of the call. `None` where nobody wants
-/// its span.
+/// Begins the span of an answer to a call of this path; `own` is the answer's context, `caller` the call's. `None` if the span is not to be
+/// recorded.
 #[allow(
     clippy::disallowed_methods,
     reason = "a span is at a moment of the wall clock; how long it took is measured by Instant"
@@ -183,7 +183,7 @@ pub fn answering(path: &str, caller: TraceContext, own: TraceContext) -> Option<
 }
 
 impl Answering {
-    /// How it ended.
+    /// Sets the status code of the answer.
     pub fn ended(&mut self, code: Code) {
         self.code = Some(code);
     }
@@ -195,7 +195,7 @@ impl Drop for Answering {
         let since_1970 = since.duration_since(UNIX_EPOCH).unwrap_or_default();
         let from_unix_ns = u64::try_from(since_1970.as_nanos()).unwrap_or(u64::MAX);
         let took_ns = u64::try_from(began.elapsed().as_nanos()).unwrap_or(u64::MAX);
-        // Nobody waited for the end of one that is dropped before.
+        // An answer that is dropped without a status was abandoned by its caller.
         let code = self.code.unwrap_or(Code::Cancelled);
         let (service, method) = self.path.rsplit_once('/').unwrap_or(("", &self.path));
         self.sender.record(Span {
@@ -218,7 +218,7 @@ impl Drop for Answering {
     }
 }
 
-/// As [`within`], where there is a context.
+/// As [`within`], if there is a context.
 pub async fn within_any<F: Future>(context: Option<TraceContext>, future: F) -> F::Output {
     match context {
         Some(context) => within(context, future).await,
@@ -226,12 +226,12 @@ pub async fn within_any<F: Future>(context: Option<TraceContext>, future: F) -> 
     }
 }
 
-/// Does something as a part of a trace.
+/// Runs a future as part of a trace.
 pub fn within<F: Future>(context: TraceContext, future: F) -> impl Future<Output = F::Output> {
     CURRENT.scope(context, future)
 }
 
-/// That of the task that runs now, if it is a part of one.
+/// The context of the running task, if any.
 pub fn current() -> Option<TraceContext> {
     CURRENT.try_with(|context| *context).ok()
 }

@@ -1,14 +1,15 @@
-//! A call that was let in, until the last byte of its answer has been sent, nobody wants it any more, or its caller has lost what it
-//! was let in with.
+//! An admitted call, until the last byte of its answer has been sent, the caller has gone, or the caller has lost a permission that it was
+//! admitted with.
 //!
 //! ```text
 //!   admitted ──▶ performed ──▶ answered ──▶ over
 //!                    └──────────────┴─ roles have changed, Caller::goes_on refuses ──▶ dropped; the caller gets the refusal
 //! ```
-//! What of an answer was made and not taken by the connection counts for its caller ([`Gate::unread`]): an answer whose first part is made is made
-//! into bytes at once, so that it is known how many wait.
+//! The part of an answer that the connection has not taken yet counts for its caller ([`Gate::unread`]). An answer whose first part is
+//! ready is encoded at once, so that the number of waiting bytes is known.
 //!
-//! A call that is dropped like this ends as one whose client went away: an acquire leaves the queue, a goal has its grace.
+//! A call that is dropped because of a lost permission ends as if its client had gone away: an acquire leaves the queue, a goal has its
+//! grace.
 
 use crate::access::Caller;
 use crate::connections::InUse;
@@ -25,7 +26,7 @@ use tonic::Status;
 use tonic::body::Body;
 use tonic::codegen::http;
 
-/// What lasts as long as a call is under way.
+/// Guards that live as long as a call is under way.
 pub(crate) struct Held {
     pub(crate) _call: Option<TaskTrackerToken>,
     pub(crate) _permit: Option<Permit>,
@@ -34,7 +35,7 @@ pub(crate) struct Held {
     pub(crate) unread: Unread,
 }
 
-/// Whose answer it is that waits for its reader, and what keeps account of that.
+/// The caller whose answer waits to be read, and the gate that counts its bytes.
 pub(crate) struct Unread {
     gate: Arc<dyn Gate>,
     caller: Caller,
@@ -45,7 +46,7 @@ impl Unread {
         Unread { gate, caller }
     }
 
-    /// A part that counts until the connection has written all of it.
+    /// Counts a part of the answer until the connection has written all of it.
     fn counted(&self, part: Frame<Bytes>) -> Result<Frame<Bytes>, Status> {
         let bytes = match part.into_data() {
             Ok(bytes) if !bytes.is_empty() => bytes,
@@ -59,7 +60,7 @@ impl Unread {
     }
 }
 
-/// Bytes that count as long as somebody has some of them.
+/// Bytes that are counted as long as any slice of them lives.
 struct Counted {
     bytes: Bytes,
     _permit: Permit,
@@ -71,11 +72,11 @@ impl AsRef<[u8]> for Counted {
     }
 }
 
-/// Says when a call's caller has lost what it was let in with.
+/// Resolves when a call's caller has lost a permission that it was admitted with.
 pub(crate) struct Revocation(Pin<Box<dyn Future<Output = Status> + Send>>);
 
 impl Revocation {
-    /// Of a call to `path` that `then` was let in for. `changes` was there before it was asked who that is.
+    /// For a call to `path` that was admitted for the caller `then`. `changes` was subscribed before `then` was determined.
     pub(crate) fn new(
         gate: Arc<dyn Gate>,
         mut changes: watch::Receiver<()>,
@@ -100,7 +101,7 @@ impl Revocation {
 }
 
 impl Held {
-    /// Until `answering` is there; why the call ended where that came first.
+    /// Waits for `answering`; the error is the revocation, if that comes first.
     pub(crate) async fn until<T>(&mut self, answering: impl Future<Output = T>) -> Result<T, Status> {
         let Some(revocation) = &mut self.revocation else { return Ok(answering.await) };
         tokio::select! {
@@ -114,14 +115,14 @@ impl Held {
 /// The body of the answer to a call. The connection asks for a part when it has begun to send the one before.
 pub(crate) struct Answer {
     body: Body,
-    /// What was made of it before the connection asked for anything.
+    /// The part that was encoded before the connection asked for any.
     first: Option<Result<Frame<Bytes>, Status>>,
-    /// Nothing once the call has ended before its time.
+    /// `None` after the call was ended early.
     held: Option<Held>,
 }
 
 impl Answer {
-    /// An answer of which the part that is there, if one is, is made into bytes.
+    /// Begins an answer; if its first part is ready, the part is encoded.
     pub(crate) async fn begin(mut body: Body, held: Held) -> Result<Answer, Status> {
         let first = std::future::poll_fn(|context| match Pin::new(&mut body).poll_frame(context) {
             Poll::Ready(first) => Poll::Ready(Some(first)),
@@ -130,7 +131,7 @@ impl Answer {
         let first = match first.await {
             Some(Some(Ok(first))) => Some(Ok(held.unread.counted(first)?)),
             Some(Some(Err(error))) => Some(Err(error)),
-            // There is nothing of it, and it is not asked again.
+            // The body is empty, and is not polled again.
             Some(None) => {
                 body = Body::empty();
                 None
@@ -140,7 +141,7 @@ impl Answer {
         Ok(Answer { body, first, held: Some(held) })
     }
 
-    /// Ends with this.
+    /// Ends the answer with this status.
     fn end(&mut self, with: &Status) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
         (self.held, self.first, self.body) = (None, None, Body::empty());
         let mut trailers = http::HeaderMap::new();

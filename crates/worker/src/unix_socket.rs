@@ -1,9 +1,9 @@
-//! A Unix socket that only those may connect to who are meant to, from its first moment: mode and group of its file.
+//! Creates a Unix socket with restricted access from the first moment on, by the mode and the group of its file.
 //!
 //! ```text
 //!   socket ─ closed to all ─▶ file (mode 0) ─ group, mode ─▶ as configured ─ listen ─▶ connections
 //! ```
-//! The kernel asks for the right to write. Who may reach the directory is the directory's business.
+//! To connect, a process needs write permission for the file. Access to the directory is up to the directory's own mode.
 
 use nix::sys::stat::{Mode, fchmod};
 use nix::unistd::{Gid, Group, chown};
@@ -14,16 +14,16 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use tokio::net::{UnixListener, UnixSocket};
 
-/// Connections that wait to be accepted, where the kernel allows so many (`net.core.somaxconn`). Beyond them it refuses new ones.
+/// Maximum number of connections waiting to be accepted, if the kernel allows so many (`net.core.somaxconn`). Further ones are refused.
 const BACKLOG: u32 = 4_096;
 
-/// Who may connect to a Unix socket, by the mode and the group of its file. What they may do then is said by their uid.
+/// The users who may connect to a Unix socket, by the mode and the group of its file. Their uid decides what they may do then.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SocketAccess {
-    /// `0o660`: the server's own user and the group; `0o666`: every user who reaches its directory.
+    /// `0o660`: the server's own user and the group; `0o666`: every user who can reach the socket's directory.
     pub mode: u32,
-    /// The group of the file, by name; the server's own unless given. The server has to be a member, or root.
+    /// The file's group, by name; by default the server's own. The server has to be a member of the group, or root.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub group: Option<String>,
 }
@@ -35,10 +35,10 @@ impl Default for SocketAccess {
 }
 
 impl SocketAccess {
-    /// The least and the greatest mode: its owner may connect, and it has no bits beyond permissions.
+    /// The least and the greatest mode: at least the owner may connect, and no bits beyond permissions are set.
     pub const MODES: std::ops::RangeInclusive<u32> = 0o600..=0o777;
 
-    /// The key that breaks a rule, and the rule.
+    /// The first fault of this config, if any: the key, and the rule that it breaks.
     pub fn fault(&self) -> Option<(&'static str, &'static str)> {
         if !Self::MODES.contains(&self.mode) {
             return Some(("socket.mode", "from 0o600 (its owner may connect) to 0o777, in octal as `0o660`"));
@@ -59,7 +59,7 @@ impl SocketAccess {
 pub(crate) fn listen(path: &Path, access: &SocketAccess) -> io::Result<UnixListener> {
     let gid = access.gid()?;
     let socket = UnixSocket::new_stream()?;
-    // The file is made with the mode of the socket: nobody connects before it is as it is to be.
+    // The file inherits the socket's mode: no process can connect before mode and group are set.
     fchmod(&socket, Mode::empty())?;
     socket.bind(path)?;
     let opened = give(path, gid, access).and_then(|()| socket.listen(BACKLOG));

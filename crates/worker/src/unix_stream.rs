@@ -1,8 +1,8 @@
-//! A connection over a Unix socket that wakes its task for what arrives, and not for what the other side has read.
+//! A connection over a Unix socket that wakes its task when data arrive, but not when the other side has read something.
 //!
-//! Each time that the other side reads, the system reports a Unix socket as writable to whoever waits for that, also where there was room all along;
-//! tokio's own stream waits for it all the time, so that every message that is sent wakes its sender once more. Here it is waited for only while a
-//! write would block.
+//! Each time the other side reads, the system reports a Unix socket as writable to a process that waits for that, even if there was room
+//! all along. Tokio's own stream always waits for it, so that every message that is sent wakes its sender once more. This stream waits for
+//! it only while a write would block.
 
 use hyper_util::rt::TokioIo;
 use std::future::Future;
@@ -18,38 +18,38 @@ use tokio::net::UnixStream as TokioStream;
 use tonic::codegen::{Service, http::Uri};
 use tonic::transport::server::{Connected, UdsConnectInfo};
 
-/// A connection. Made within a tokio runtime.
+/// A connection. It has to be made within a tokio runtime.
 #[derive(Debug)]
 pub(crate) struct UnixStream {
     stream: AsyncFd<StdStream>,
-    /// While a write waits: the same socket once more.
+    /// While a write waits: a second handle of the same socket.
     room: Option<AsyncFd<StdStream>>,
     peer: UdsConnectInfo,
 }
 
 impl UnixStream {
-    /// Of tokio's.
+    /// Wraps tokio's stream.
     pub(crate) fn of(stream: TokioStream) -> io::Result<UnixStream> {
         let peer = stream.connect_info();
         Ok(UnixStream { stream: watched(stream.into_std()?, Interest::READABLE)?, room: None, peer })
     }
 
-    /// To the server that listens there.
+    /// Connects to the server that listens at `path`.
     pub(crate) async fn connect(path: PathBuf) -> io::Result<UnixStream> {
         UnixStream::of(TokioStream::connect(path).await?)
     }
 
-    /// Without a runtime.
+    /// The stream, detached from the runtime.
     pub(crate) fn into_std(self) -> StdStream {
         self.stream.into_inner()
     }
 
-    /// The socket itself, which never blocks.
+    /// The socket itself, which is non-blocking.
     pub(crate) fn socket(&self) -> &StdStream {
         self.stream.get_ref()
     }
 
-    /// Who is at the other end.
+    /// The identity of the other end.
     pub(crate) fn peer(&self) -> &UdsConnectInfo {
         &self.peer
     }
@@ -98,7 +98,7 @@ impl AsyncRead for UnixStream {
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => ready.clear_ready(),
                 Err(error) => return Poll::Ready(Err(error)),
                 Ok(read) => {
-                    // That was all: the system reports what comes next.
+                    // The read was short, so the socket is empty: the system will report further data.
                     if (1..room).contains(&read) {
                         ready.clear_ready();
                     }
@@ -144,7 +144,7 @@ impl Connected for UnixStream {
     }
 }
 
-/// Connects to one path, for a channel of tonic.
+/// A connector to one path, for a channel of tonic.
 #[derive(Debug, Clone)]
 pub(crate) struct UnixConnector(pub(crate) PathBuf);
 
@@ -236,7 +236,7 @@ mod tests {
         let mut heard = Vec::new();
         stream.read_to_end(&mut heard).await.unwrap();
         assert_eq!(heard, b"last");
-        // And the other way round.
+        // The same in the other direction.
         let (mut stream, mut other) = pair();
         stream.shutdown().await.unwrap();
         assert_eq!(other.read(&mut [0; 8]).await.unwrap(), 0);

@@ -1,9 +1,9 @@
 //! The condition of a daemon's core, as the core reports it: whether it takes its turns, whether it can do its work, and why it has ended.
 //!
 //! ```text
-//!   core ── beat, at every turn ──────────▶ systemd's watchdog (a core that hangs is silent)
+//!   core ── beat, at every turn ──────────▶ systemd's watchdog (a core that hangs does not beat)
 //!        ── unwell / well ────────────────▶ gRPC health, systemd's status
-//!        ── fail (panicked, fenced) ──────▶ serving ends at once, the process with a code of its own
+//!        ── fail (panicked, fenced) ──────▶ serving ends at once, the process exits with its own code
 //! ```
 //! Clones share one condition.
 
@@ -16,30 +16,30 @@ use tokio::sync::watch;
 pub const EXIT_CODE_PANICKED: u8 = 70;
 /// The exit code of a daemon whose state another process has taken over (`EX_IOERR` of `sysexits.h`).
 pub const EXIT_CODE_FENCED: u8 = 74;
-/// The exit code of a daemon in whose place another one leads (`EX_TEMPFAIL` of `sysexits.h`): started again, it stands by.
+/// The exit code of a daemon that has lost the leadership to another one (`EX_TEMPFAIL` of `sysexits.h`): started again, it stands by.
 pub const EXIT_CODE_DEPOSED: u8 = 75;
 
-/// Why a core has ended before its time.
+/// Why a core has ended early.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum CoreFailure {
     /// A defect of the program: a panic.
     #[error("{part} has ended by a defect, and the process with it: {what}; please report it")]
     Panicked {
-        /// Which part of the process.
+        /// The part of the process.
         part: String,
         /// The message of the panic.
         what: String,
     },
-    /// Another process has taken over the state. This one answers nothing more, and ends.
+    /// Another process has taken over the state. This process answers no more calls, and ends.
     #[error("{what}")]
     Fenced {
-        /// Which state, and what to do.
+        /// The state, and advice.
         what: String,
     },
-    /// Another process leads, as it may where several share a state. It says nothing more, and ends.
+    /// Another process leads, which is normal if several share a state. This process answers no more calls, and ends.
     #[error("{what}")]
     Deposed {
-        /// Which state.
+        /// The state.
         what: String,
     },
 }
@@ -65,7 +65,7 @@ impl CoreFailure {
 /// The condition of a core.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Condition {
-    /// Why the core cannot do its work; it is served all the same, for what it still can do.
+    /// Why the core cannot do its work. It still answers the calls that it can.
     pub unwell: Option<String>,
     /// Why the core has ended. The first reason stays.
     pub failure: Option<CoreFailure>,
@@ -83,7 +83,7 @@ struct Inner {
 }
 
 impl Vitals {
-    /// The core takes a turn. From the first beat on the watchdog expects more.
+    /// Records a turn of the core. From the first beat on, the watchdog expects more.
     pub fn beat(&self) {
         self.0.beats.fetch_add(1, Ordering::Relaxed);
         self.0.beating.store(true, Ordering::Relaxed);
@@ -94,7 +94,7 @@ impl Vitals {
         self.0.beating.load(Ordering::Relaxed).then(|| self.0.beats.load(Ordering::Relaxed))
     }
 
-    /// The core cannot do its work.
+    /// Reports that the core cannot do its work.
     pub fn unwell(&self, why: impl Into<String>) {
         let why = Some(why.into());
         self.0.condition.send_if_modified(|condition| {
@@ -104,12 +104,12 @@ impl Vitals {
         });
     }
 
-    /// The core can do its work again.
+    /// Reports that the core can do its work again.
     pub fn well(&self) {
         self.0.condition.send_if_modified(|condition| condition.unwell.take().is_some());
     }
 
-    /// The core has ended.
+    /// Reports that the core has ended.
     pub fn fail(&self, failure: CoreFailure) {
         tracing::error!(%failure, "the process ends");
         self.0.condition.send_if_modified(|condition| {
@@ -124,19 +124,19 @@ impl Vitals {
         self.0.condition.subscribe()
     }
 
-    /// Resolves when the core has ended before its time.
+    /// Resolves when the core has ended early.
     pub async fn failed(&self) -> CoreFailure {
         let mut condition = self.condition();
         let failed =
             condition.wait_for(|condition| condition.failure.is_some()).await.map(|found| found.failure.clone());
         match failed.ok().flatten() {
             Some(failure) => failure,
-            // Every sender is gone.
+            // All senders are gone.
             None => std::future::pending().await,
         }
     }
 
-    /// Does `work`. A panic in it is the end of the core.
+    /// Performs `work`. A panic in it ends the core.
     pub async fn guard<T>(&self, part: &str, work: impl Future<Output = T>) -> Option<T> {
         use futures::FutureExt;
         match std::panic::AssertUnwindSafe(work).catch_unwind().await {

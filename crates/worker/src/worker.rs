@@ -34,13 +34,13 @@ use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 
-/// The pause before the brakes are asked again.
+/// Pause before the brakes are asked again.
 const BRAKES_AGAIN: Duration = Duration::from_secs(1);
 
-/// The pause before a resource that was refused is offered again, in another session.
+/// Pause before a refused resource is offered again, in another session.
 const OFFER_AGAIN: Duration = Duration::from_secs(1);
 
-/// A part of the process, for its log.
+/// The name of this part of the process in the log.
 const LEASES: &str = "the watch of leases";
 
 /// How a worker is started: the options that [`Worker::from_args`] reads from the command line.
@@ -68,7 +68,8 @@ pub struct WorkerOptions {
     /// ([`crate::access::ACCESS_VARIABLE`]). Without either, root and the user who runs the worker are operators, and all others have the
     /// default roles.
     pub access: Option<PathBuf>,
-    /// The authorities that the worker trusts as a client, and the certificate that it shows; [`ClientTls::from_environment`] unless given.
+    /// The authorities that the worker trusts as a client, and the certificate that it presents; by default
+    /// [`ClientTls::from_environment`].
     pub tls: Option<ClientTls>,
 }
 
@@ -104,7 +105,7 @@ pub enum WorkerError {
     /// Serving failed.
     #[error("the worker cannot serve")]
     Serve(#[from] ServeError),
-    /// Nobody says where the resource manager is.
+    /// The worker knows no resource manager.
     #[error(
         "goals of worker `{id}` need a lease, and nobody says which resource manager confirms it: set {RESOURCE_MANAGER_VARIABLE} to its \
          endpoint, or to file:PATH where PATH holds that, or build the worker `without_leases()`"
@@ -124,7 +125,7 @@ pub enum WorkerError {
         "the worker moves something (it has a Safety), and asks for no lease: give it the id of its resource (WorkerOptions::id)"
     )]
     MovesWithoutLease,
-    /// It is not known which session offers the worker's resource. Without that, anybody could offer another resource of the same id, and
+    /// It is unknown which session offers the worker's resource. Without that, another client could offer a resource of the same id, and
     /// lease that.
     #[error(
         "goals of worker `{id}` need a lease, and nobody says which session offers its resource: set {PROVIDER_SESSION_VARIABLE} to that \
@@ -143,13 +144,13 @@ pub enum WorkerError {
     MovesInPool {
         /// The worker's resource.
         id: String,
-        /// The least bound.
+        /// The minimum bound in milliseconds.
         needed_ms: u128,
     },
-    /// The variables that its process manager sets cannot be read.
+    /// A variable that the worker's process manager sets has an invalid value.
     #[error("the environment of the worker is not that of a pooled one")]
     Pooled(#[from] PooledError),
-    /// The descriptions of its actions exceed the bounds of a description.
+    /// The descriptions of its actions exceed the limits.
     #[error("the worker's description")]
     Description(#[from] DescriptionError),
     /// The resource manager refuses its resource.
@@ -325,7 +326,7 @@ impl Worker {
             true => None,
             false => Some(pooled(&options.id, standstill.filter(|_| safety.is_some()))?),
         };
-        // What moves is not given up: its goal may be what holds it.
+        // A worker that moves something is not given up: its goal may be what holds the load.
         let stuck_after = if safety.is_none() { stuck_after()? } else { None };
         if let Some(patience) = stuck_after {
             actions = actions.stuck_after(patience);
@@ -342,8 +343,8 @@ impl Worker {
         if let Some(safety) = &safety {
             actions = actions.safety(safety.clone());
         }
-        // A pooled worker is offered by its process manager once it serves, which waits until another one that was killed stands still. Its brakes
-        // know that earlier.
+        // The process manager offers a pooled worker when it serves, and waits before that until a killed predecessor stands still. The
+        // worker's brakes know that earlier.
         let stands_alone = options.resource_manager.is_some();
         let rests = stands_alone || (confirms && safety.is_some());
         if rests {
@@ -375,7 +376,7 @@ impl Worker {
             served
         };
         let serving = tokio::spawn(exit_on_panic("the server of the worker", serve));
-        // Connections are accepted from the bind on: whoever reads the file is answered.
+        // Connections are accepted from the bind on: a client that reads the file gets answers.
         let published = match &options.endpoint_file {
             Some(file) => Some(
                 publish_file(file, &endpoint).map_err(system(&format!("write its endpoint to {}", file.display())))?,
@@ -391,7 +392,7 @@ impl Worker {
         while let Some(manager) = &options.resource_manager
             && shutdown.run_until_cancelled(taken(offered.as_ref())).await.is_some()
         {
-            // What was held of it is another's to give, or nobody's.
+            // The former leases of the resource have ended, or belong to another caller's session.
             leases.lost("the id of the worker's session is another caller's");
             drop(offered.take());
             let again = offer(&channels, manager, &options, &endpoint, &leases, standstill);
@@ -405,12 +406,12 @@ impl Worker {
             () = shutdown.cancelled() => {}
             why = server.stuck(), if stuck_after.is_some() => {
                 tracing::error!(id = %options.id, "the worker ends itself, for another one to be started: {why}");
-                // What is stuck would keep a process alive that ends in order, and for other goals its end is a crash in any case.
+                // A stuck goal would keep the process alive that ends in order; for other goals the end is a crash in any case.
                 std::process::exit(EXIT_CODE_PANICKED.into());
             }
         }
         drop(published);
-        // What the goals move stays this worker's until nothing moves any more.
+        // The resources stay this worker's until nothing moves any more.
         let (served, stopped) =
             tokio::join!(serving, tokio::time::timeout(crate::server::DRAIN_DEADLINE, server.shut_down()));
         if let Some(sender) = ratn_otlp::sender() {
@@ -434,7 +435,7 @@ impl Worker {
     }
 }
 
-/// What the process manager of a pooled worker says; `moves_within` is the bound for the standstill of one that moves something.
+/// The settings from the process manager of a pooled worker; `moves_within` is the bound for standstill of a worker that moves something.
 fn pooled(id: &str, moves_within: Option<Duration>) -> Result<Pooled, WorkerError> {
     let id = id.to_owned();
     let Some(pooled) = Pooled::from_environment()? else { return Err(WorkerError::NoManager { id }) };
@@ -447,7 +448,7 @@ fn pooled(id: &str, moves_within: Option<Duration>) -> Result<Pooled, WorkerErro
     }
 }
 
-/// Nothing may move of what a process before this one began: its brakes say so. Without brakes the time has passed after which nothing moves.
+/// Makes sure that no motion of an earlier process goes on. Brakes confirm that; without brakes, the bound for standstill is waited for.
 async fn bring_to_rest(leases: LeaseWatch, safety: Option<Safety>, standstill: Option<Duration>) {
     let mut has_brakes = false;
     if let Some(safety) = safety {
@@ -465,8 +466,8 @@ async fn bring_to_rest(leases: LeaseWatch, safety: Option<Safety>, standstill: O
     leases.brought_to_rest();
 }
 
-/// Nobody is offered a worker that refuses every goal because it has never heard the resource manager, or, where it `rests` first, whose
-/// brakes have not said that nothing moves.
+/// Keeps health at NOT_SERVING until the resource manager has been heard and, if the worker `rests` first, its brakes have confirmed that
+/// nothing moves: otherwise a worker would be offered that refuses every goal.
 fn serve_once_heard(leases: &LeaseWatch, vitals: &Vitals, rests: bool) -> AbortOnDropHandle<()> {
     vitals.unwell("the resource manager has not been heard yet: every goal is refused");
     let (mut heard, leases, vitals) = (leases.heard(), leases.clone(), vitals.clone());
@@ -475,7 +476,7 @@ fn serve_once_heard(leases: &LeaseWatch, vitals: &Vitals, rests: bool) -> AbortO
         while !leases.is_heard() && heard.changed().await.is_ok() {}
         if rests {
             vitals.unwell("its brakes have not said yet that nothing moves: every goal is refused");
-            // Whoever starts it waits only so long, and points to the log.
+            // The process that starts the worker waits for a limited time, and refers to the log.
             tracing::info!("it is ready when its brakes have said that nothing moves, and have let go");
             leases.rested().await;
         }
@@ -484,14 +485,15 @@ fn serve_once_heard(leases: &LeaseWatch, vitals: &Vitals, rests: bool) -> AbortO
     AbortOnDropHandle::new(tokio::spawn(exit_on_panic(LEASES, hear)))
 }
 
-/// What a worker offers by itself.
+/// The resource that a worker offers by itself.
 struct Offered {
     session: Session,
     provider: Provider,
     watching: AbortOnDropHandle<()>,
 }
 
-/// Returns when it is to be offered in a session of another id: that of its session is another caller's, or there is none.
+/// Returns when the resource has to be offered in a session of another id: its session's id belongs to another caller, or there is no
+/// session.
 async fn taken(offered: Option<&Offered>) {
     match offered {
         Some(offered) => offered.session.taken().await,

@@ -1,9 +1,9 @@
 //! The detector worker: finds objects on a surface in depth images.
 //!
-//! It asks the camera that its goal's lease holds for a picture. It works on nothing but that picture, the poses of camera and robot that
-//! come with it, and the region or the object that the goal names. Objects are named `box_1`, `fork_1`, `box_2`, …, the nearest first (from
-//! another number on where the goal says `first`). Each has its class, the confidence of that, its pose in the world frame (metres) and the
-//! covariance of the pose.
+//! It takes a picture with the camera in its goal's lease. It uses nothing but that picture, the poses of camera and robot that come with
+//! it, and the region or the object that the goal names. Objects are named `box_1`, `fork_1`, `box_2`, …, the nearest first (numbered from
+//! `first` if the goal gives it). Each has its class, the confidence of that, its pose in the world frame (metres) and the covariance of
+//! the pose.
 
 mod body;
 mod facts;
@@ -23,18 +23,18 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// Frames of a picture in which a whole surface is searched, unless the goal says otherwise: noise falls with their root.
+/// Default number of frames in a picture in which a whole surface is searched: noise falls with the square root of their number.
 const SEGMENT_FRAMES: i64 = 60;
-/// Frames of a picture in which one known object is looked for.
+/// Number of frames in a picture in which one known object is searched.
 const LOCATE_FRAMES: i64 = 8;
-/// How well a surface is known whose height a goal gives, and how level it is: as furniture and a floor are.
+/// Standard deviations of a surface whose height the goal gives: of its height, and of its tilt; as for furniture and floors.
 const SURFACE_SIGMA_M: f64 = 0.001;
 const SURFACE_SIGMA_RAD: f64 = 0.002;
-/// Postures of the robot in one picture at the most.
+/// Maximum number of robot postures in one picture.
 const MAX_POSTURES: usize = 64;
 
-/// Serves until a signal or the end of the parent process. With `pictures`, a folder, every picture and what was found in it is kept there
-/// as PNG files.
+/// Serves until a signal or the end of the parent process. If the folder `pictures` is given, every picture and its detections are saved
+/// there as PNG files.
 ///
 /// # Errors
 /// The worker cannot start, or serving failed ([`ratn_worker::worker::WorkerError`]).
@@ -42,7 +42,7 @@ pub async fn run(options: WorkerOptions, robot: Robot, pictures: Option<PathBuf>
     Ok(worker(options, robot, pictures).run().await?)
 }
 
-/// The worker, which does not run yet.
+/// The worker, not running yet.
 pub fn worker(options: WorkerOptions, robot: Robot, pictures: Option<PathBuf>) -> Worker {
     let eyes = Eyes { robot: Arc::new(robot), pictures: Pictures::into(pictures) };
     Worker::new(options).action(Segment(eyes.clone())).action(Locate(eyes))
@@ -52,18 +52,18 @@ pub fn worker(options: WorkerOptions, robot: Robot, pictures: Option<PathBuf>) -
 #[derive(Debug)]
 pub struct Segment(Eyes);
 
-/// The action `detector/locate`: looks for one known object again.
+/// The action `detector/locate`: searches one known object again.
 #[derive(Debug)]
 pub struct Locate(Eyes);
 
-/// What both actions look with.
+/// What both actions need to take and evaluate pictures.
 #[derive(Debug, Clone)]
 struct Eyes {
     robot: Arc<Robot>,
     pictures: Pictures,
 }
 
-/// A picture, and where the robot is in it.
+/// A picture, with the space that the robot occupies in it.
 struct Seen {
     image: DepthImage,
     camera: Camera,
@@ -86,7 +86,7 @@ impl Action for Segment {
     }
 
     fn can_be_suspended(&self) -> bool {
-        // It moves nothing.
+        // The action moves nothing.
         true
     }
 
@@ -134,7 +134,7 @@ impl Action for Locate {
     }
 
     fn can_be_suspended(&self) -> bool {
-        // It moves nothing.
+        // The action moves nothing.
         true
     }
 
@@ -158,8 +158,8 @@ impl Action for Locate {
 }
 
 impl Eyes {
-    /// Finds objects in a picture of the leased camera, on a thread of its own. That takes milliseconds: a goal that has to stop meanwhile just
-    /// drops the answer.
+    /// Finds objects in a picture of the leased camera, on a thread of its own. That takes milliseconds: a goal that has to stop meanwhile
+    /// just drops the answer.
     async fn find(
         &self,
         goal: &GoalContext,
@@ -175,7 +175,7 @@ impl Eyes {
         Ok(goal.unless_cancelled(searching).await???)
     }
 
-    /// A picture of the leased camera.
+    /// Takes a picture with the leased camera.
     async fn look(&self, goal: &GoalContext, default_frames: i64) -> Result<Seen, ActionFailure> {
         let frames = goal.optional_int("frames")?.unwrap_or(default_frames);
         let inputs = BTreeMap::from([("frames".to_owned(), Value::Int(frames))]);
@@ -205,14 +205,14 @@ impl Eyes {
 }
 
 impl Seen {
-    /// The objects relative to the camera's given pose, corrected by what is known of that pose and of the surface.
+    /// The object, corrected by what is known of the camera's pose and of the surface.
     fn in_the_world(&self, object: Detection, surface: Option<&Surface>) -> Detection {
         let object = object.with_calibration(&self.camera, &self.calibration);
         surface.map_or(object, |surface| object.standing_on(surface, &self.camera, &self.calibration))
     }
 }
 
-/// The variances of the camera's pose along (m²) and about (rad²) the axes of its optical frame; `None` where the camera does not say them.
+/// The variances of the camera's pose along (m²) and about (rad²) the axes of its optical frame; zero if the camera does not report them.
 fn calibration(port: Option<Port>) -> Result<Calibration, ActionFailure> {
     let Some(port) = port else { return Ok([0.0; 6]) };
     let variances = port.list()?.iter().map(|entry| entry.float()).collect::<Result<Vec<_>, _>>()?;
@@ -222,7 +222,7 @@ fn calibration(port: Option<Port>) -> Result<Calibration, ActionFailure> {
     }
 }
 
-/// The height of the surface in metres, where the goal gives it.
+/// The surface by its height in metres, if the goal gives it.
 fn surface(goal: &GoalContext) -> Result<Option<Surface>, ActionFailure> {
     let Some(height_m) = goal.optional_float("surface_m")? else { return Ok(None) };
     Ok(Some(Surface { height_m, sigma_m: SURFACE_SIGMA_M, sigma_rad: SURFACE_SIGMA_RAD }))
@@ -236,7 +236,7 @@ fn posture(robot: &Robot, port: &Port) -> Result<Configuration, ActionFailure> {
     })
 }
 
-/// The classes that the goal looks for: all of them, unless it names some.
+/// The classes to search for: all, unless the goal names some.
 fn classes(goal: &GoalContext) -> Result<Vec<ObjectClass>, ActionFailure> {
     let Some(port) = goal.port("classes").optional() else { return Ok(ObjectClass::ALL.to_vec()) };
     let named = |port: &Port| {
@@ -249,7 +249,7 @@ fn classes(goal: &GoalContext) -> Result<Vec<ObjectClass>, ActionFailure> {
     port.list()?.iter().map(named).collect()
 }
 
-/// What is said of an object beside its name.
+/// The properties of an object that are reported with its name.
 fn described(object: &Detection) -> [(&'static str, Value); 5] {
     let floats = |values: &mut dyn Iterator<Item = f64>| Value::List(values.map(Value::Float).collect());
     [

@@ -1,9 +1,10 @@
 //! The path planner worker: `plan` for the arm, and `drive` for the base.
 //!
-//! For each goal it fetches the scene of the goal's projection (as the difference to a scene that it has), plans on a thread of its own, and
-//! answers with a timed trajectory. All durations in goals and answers are in the robot's seconds; `clock` converts them to wall time. With
-//! `budget_s`, planning takes exactly that long and finds a quicker motion. Without it, the first path is improved as long as that saves more
-//! of the motion than it takes, for 50 ms of wall time at least. Where the goal may improve its result, that is its first one, and it goes on.
+//! For each goal it fetches the scene of the goal's projection (as the difference from a scene that it has), plans on a thread of its own,
+//! and returns a timed trajectory. All durations in goals and answers are in seconds of robot time; `clock` converts them to wall time.
+//! With `budget_s`, planning takes exactly that long and finds a quicker motion. Without it, the first path is improved as long as that
+//! saves more of the motion than it takes, but for at least 50 ms of wall time. If the goal may improve its result, this is its first
+//! result, and planning goes on.
 
 mod arms;
 mod bounds;
@@ -31,7 +32,7 @@ pub struct PlanAction {
     scenes: Arc<SceneCache>,
 }
 
-/// The worker for a robot, which does not run yet. `speed` is how many of the robot's seconds pass in one second of wall time.
+/// The worker for a robot, not running yet. `speed` is the number of seconds of robot time per second of wall time.
 pub fn worker(options: WorkerOptions, robot: Robot, speed: f64) -> Worker {
     let plan = PlanAction::new(robot, speed);
     let drive = DriveAction::new(&plan.robot, speed, &plan.scenes);
@@ -68,7 +69,7 @@ impl Action for PlanAction {
     }
 
     fn can_be_suspended(&self) -> bool {
-        // It moves nothing.
+        // The action moves nothing.
         true
     }
 
@@ -76,7 +77,7 @@ impl Action for PlanAction {
         let begin = Instant::now();
         let robot = arms::moving(&self.robot, &goal)?;
         let (asked, budget_s) = goal::asked(&goal, &robot)?;
-        // Whatever the task declared that this plan depends on, and no more.
+        // The scene contains what the task declared as read by this plan, and nothing more.
         let scene = goal.unless_cancelled(goal.scene(&self.scenes)).await??;
         let scene = arms::in_hands(&robot, scene)?;
         let request = asked.in_scene(&robot, &scene);
@@ -88,7 +89,7 @@ impl Action for PlanAction {
             let outcome = plan(&robot, &scene, &request, &mut |progress| clock.control(progress));
             let _ = tell.send((outcome, clock.figures()));
         };
-        // A thread of its own, which can be nice without another goal being so after it.
+        // A thread of its own, so that its nice value affects no later goal.
         std::thread::Builder::new().name("planner".to_owned()).spawn(planning)?;
         let planned =
             planned.await.map_err(|_| ActionFailure::aborted("the planner panicked: see the worker's log"))?;

@@ -1,4 +1,4 @@
-//! The extended attributes of a file: lists of who may do what beside the mode, labels, and what users have noted.
+//! The extended attributes of a file: access control lists beside the mode, security labels, and users' own attributes.
 
 use rustix::fs::{XattrFlags, fgetxattr, flistxattr, fremovexattr, fsetxattr};
 use rustix::io::Errno;
@@ -6,13 +6,13 @@ use std::collections::BTreeMap;
 use std::ffi::CString;
 use std::fs::File;
 
-/// As long as the names of all, or the value of one can be.
+/// Maximum size of the list of names, and of a value.
 const MOST_BYTES: usize = 64 << 10;
 
-/// Gives a new file those of an old one, and no others.
+/// Copies the extended attributes of an old file to a new one, and removes all others there.
 ///
 /// # Errors
-/// The name of one that cannot be kept, and why.
+/// The name of an attribute that cannot be copied, and the error.
 pub(super) fn keep(old: &File, new: &File) -> Result<(), String> {
     let (kept, own) = (all(old)?, all(new)?);
     for (name, value) in &kept {
@@ -20,7 +20,7 @@ pub(super) fn keep(old: &File, new: &File) -> Result<(), String> {
             fsetxattr(new, name, value, XattrFlags::empty()).map_err(|error| failed(name, error))?;
         }
     }
-    // A folder may give its files a list of who may do what; labels are given by the system.
+    // A folder may give new files an access control list; security labels are set by the system.
     let is_removed = |name: &&CString| !kept.contains_key(*name) && !name.as_bytes().starts_with(b"security.");
     own.keys().filter(is_removed).try_for_each(|name| fremovexattr(new, name).map_err(|error| failed(name, error)))
 }
@@ -29,7 +29,7 @@ fn all(file: &File) -> Result<BTreeMap<CString, Vec<u8>>, String> {
     let mut bytes = vec![0; MOST_BYTES];
     let length = match flistxattr(file, &mut bytes[..]) {
         Ok(length) => length,
-        // The file system has none.
+        // The file system does not support them.
         Err(Errno::OPNOTSUPP) => 0,
         Err(error) => return Err(format!("its extended attributes cannot be read: {error}")),
     };

@@ -1,4 +1,4 @@
-//! A task file on the disk: read with a bound, known by a digest, and replaced as a whole.
+//! A task file on disk: read with a size limit, identified by a digest, and replaced as a whole.
 
 use super::attributes;
 use ring::digest::{SHA256, digest as hashed};
@@ -13,41 +13,41 @@ pub(crate) enum FileError {
     /// It cannot be read.
     #[error("cannot read {}: {why}", path.display())]
     Read {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// The error.
         why: String,
     },
     /// It cannot be written.
     #[error("cannot write {}: {why}; nothing was changed", path.display())]
     Write {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// The error.
         why: String,
     },
-    /// It is not as it was.
+    /// The file has changed.
     #[error("the file has changed")]
     Changed,
 }
 
-/// The text of a regular file of bounded length.
+/// The text of a regular file of at most `most` bytes.
 pub(super) fn read(path: &Path, most: usize) -> Result<String, FileError> {
     ratn_regular_file::read_text(path, most)
         .map_err(|error| FileError::Read { path: path.to_owned(), why: error.to_string() })
 }
 
-/// What a text is known by.
+/// The digest that identifies a text.
 pub(super) fn digest(text: &str) -> String {
     hashed(&SHA256, text.as_bytes()).as_ref().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// Puts a new text in the place of the old one, if that is still there: it is written beside it, synced, and renamed. Mode, owner and
-/// extended attributes stay.
+/// Replaces the old text by a new one, if the file still contains the old one: the new text is written to a file beside it, synced, and
+/// renamed. Mode, owner and extended attributes stay.
 pub(super) fn replace(path: &Path, old: &str, new: &str, most: usize) -> Result<(), FileError> {
     let refused = |why: &str| FileError::Write { path: path.to_owned(), why: why.to_owned() };
     let failed = |error: io::Error| refused(&error.to_string());
-    // Of a link the file that it leads to is replaced.
+    // For a symbolic link, its target is replaced.
     let path = path.canonicalize().map_err(failed)?;
     let there = std::fs::metadata(&path).map_err(failed)?;
     if there.permissions().readonly() {
@@ -75,21 +75,21 @@ pub(super) fn replace(path: &Path, old: &str, new: &str, most: usize) -> Result<
                 .map_err(|_| refused("it belongs to another user or group, and would not any more"))?;
         }
         file.set_permissions(Permissions::from_mode(there.mode() & 0o7777)).map_err(failed)?;
-        // Behind the mode, of which the list of who may do what is a part.
+        // After the mode, which contains a part of the access control list.
         attributes::keep(&ratn_regular_file::open(&path).map_err(failed)?, &file).map_err(|why| refused(&why))?;
         file.sync_all().map_err(failed)?;
-        // As late as can be: whoever writes it in an editor meanwhile is not overwritten.
+        // As late as possible, so that a change by an editor meanwhile is not overwritten.
         if read(&path, most)? != old {
             return Err(FileError::Changed);
         }
         std::fs::rename(&beside, &path).map_err(failed)
     };
     if let Err(error) = written() {
-        // It was made here, and nobody knows it.
+        // This function created it, and no other process uses it.
         let _ = std::fs::remove_file(&beside);
         return Err(error);
     }
-    // The new text is there; whether its name is on the disk already changes nothing of that.
+    // The new text is in place, even if its directory entry is not synced yet.
     let _ = File::open(folder).and_then(|folder| folder.sync_all());
     Ok(())
 }

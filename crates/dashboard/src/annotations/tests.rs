@@ -48,14 +48,14 @@ fn states_are_told_with_what_they_say_and_what_is_in_force() {
     assert_eq!(force(0, "duration"), ("2".to_owned(), "this state".to_owned()));
     assert_eq!(force(0, "computes").1, "the catalogue, of path_planner/plan");
     assert_eq!(force(0, "requires").1, "default: nobody says otherwise");
-    // Also of a state that is tried again.
+    // This also holds for a state with `retry`.
     assert!(force(1, "resources").0.contains("Gripper"));
     assert!(told.predicates.iter().any(|one| one == "on(?, ?)"), "{:?}", told.predicates);
-    // Without an ontology, those that the file and what the catalogue says of its actions name.
+    // Without an ontology: the individuals that the file names, and those in the catalogue's annotations of its actions.
     assert_eq!(told.entities, ["base", "gripper"]);
 }
 
-/// What is offered at each place of a predicate of this task.
+/// The words offered at each place of a predicate of this task.
 fn offered(task: &str, predicate: &str) -> Vec<Vec<String>> {
     let program = load(task, "t.yaml", &Catalogue::standard()).unwrap().program;
     let words = words(Some(&program));
@@ -171,7 +171,7 @@ fn extended_attributes_stay() {
         eprintln!("skipped: the file system of {} keeps no extended attributes: {error}", folder.path().display());
         return;
     }
-    // The user 12345 may read it: version 2, then tag, permissions and id of each entry.
+    // User 12345 gets read access: version 2, then tag, permissions and id of each entry.
     let entries: [(u16, u16, u32); 5] =
         [(1, 6, u32::MAX), (2, 4, 12_345), (4, 4, u32::MAX), (0x10, 4, u32::MAX), (0x20, 0, u32::MAX)];
     let bytes = entries
@@ -208,7 +208,7 @@ fn what_else_a_state_may_say_of_itself_is_written_as_it_is_typed() {
     }
     saved(&editing, &proposal(&editing, "open", "pia", Some(&["true"]))).unwrap();
     assert!(on_disk(&editing).contains(", pia: true }"), "{}", on_disk(&editing));
-    // Two of the three that are one key, and no boolean.
+    // Two of the three keys that form one annotation, and a value that is no boolean.
     for (key, items) in [("pia", &["true"][..]), ("deterministic", &["maybe"])] {
         let twice = proposal(&editing, "plan", "computes", Some(&["true"]));
         let both = Proposal {
@@ -229,7 +229,7 @@ fn what_has_changed_on_the_disk_is_not_overwritten() {
     std::fs::write(&editing.0.file, &other).unwrap();
     assert!(matches!(saved(&editing, &seen), Err(Problem::Changed { .. })));
     assert!(matches!(proposed(&editing, &seen), Err(Problem::Changed { .. })));
-    // Also not what changes while it is written.
+    // A change during the write is also detected.
     assert!(matches!(file::replace(&editing.0.file, TASK, "new", MAX_SOURCE), Err(FileError::Changed)));
     assert_eq!(on_disk(&editing), other);
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
@@ -273,7 +273,7 @@ async fn what_it_would_gain_is_said_or_why_it_is_not() {
     assert!(bad.before_s.is_some() && bad.after_s.is_none() && bad.obstacle.contains("refuses"), "{bad:?}");
 }
 
-/// A simulation that has no end of its own. Beside it stands how many of them go on.
+/// A simulation that never ends by itself, with the number of those that are running.
 fn endless(folder: &tempfile::TempDir) -> (Editing, Arc<AtomicU64>) {
     let (file, going_on) = (folder.path().join("t.yaml"), Arc::new(AtomicU64::new(0)));
     std::fs::write(&file, TASK).unwrap();
@@ -335,7 +335,7 @@ async fn a_simulation_for_which_nobody_waits_any_more_ends_its_thread() {
     }
     let began = Instant::now();
     asked.abort();
-    // The thread gives its place back when it has ended.
+    // The thread releases its permit when it has ended.
     let place = editing.0.simulating.acquire().await.unwrap();
     assert!(began.elapsed() < SIMULATION / 2, "{:?}", began.elapsed());
     assert_eq!(going_on.load(Ordering::SeqCst), 0);

@@ -1,12 +1,12 @@
-//! The container: records of the MCAP format, version 0 (mcap.dev/spec), in chunks that are not compressed, with an index at the end.
+//! The MCAP container, version 0 (mcap.dev/spec): records in uncompressed chunks, with an index at the end.
 //!
-//! Of a chunk that is written only its index is kept, some 100 bytes for each MiB.
+//! Of a written chunk only its index is kept in memory, about 100 bytes per MiB.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
 
 const MAGIC: [u8; 8] = [0x89, b'M', b'C', b'A', b'P', b'0', b'\r', b'\n'];
-/// A chunk is closed once it is larger.
+/// A chunk is closed when it exceeds this size.
 const CHUNK_BYTES: usize = 1 << 20;
 
 #[derive(Debug, Clone, Copy)]
@@ -25,7 +25,7 @@ enum Op {
     DataEnd = 0x0f,
 }
 
-/// A file under way.
+/// A file that is being written.
 pub(crate) struct File<W> {
     out: W,
     written: u64,
@@ -37,7 +37,7 @@ pub(crate) struct File<W> {
 }
 
 struct Channel {
-    /// Its records of schema and channel.
+    /// Its schema record and its channel record.
     schema: Vec<u8>,
     channel: Vec<u8>,
     messages: u64,
@@ -48,7 +48,7 @@ struct Chunk {
     records: Vec<u8>,
     first_ns: u64,
     last_ns: u64,
-    /// By channel: times, and where in the chunk.
+    /// By channel: time and offset in the chunk of each message.
     messages: BTreeMap<u16, Vec<(u64, u64)>>,
 }
 
@@ -63,7 +63,7 @@ impl<W: Write> File<W> {
         Ok(file)
     }
 
-    /// A topic with a schema of its own. Its number is for [`File::message`].
+    /// Adds a topic with its schema. Returns the channel's number, for [`File::message`].
     pub(crate) fn channel(&mut self, topic: &str, encoding: &str, schema: (&str, &str, &[u8])) -> io::Result<u16> {
         let id = self.channels.len() as u16 + 1;
         let (name, schema_encoding, data) = schema;
@@ -77,7 +77,7 @@ impl<W: Write> File<W> {
 
     pub(crate) fn message(&mut self, channel: u16, at_ns: u64, data: &[u8]) -> io::Result<()> {
         let of = &mut self.channels[usize::from(channel) - 1];
-        // The number of a message goes round.
+        // The sequence number of a message may wrap around.
         let number = of.messages as u32;
         of.messages += 1;
         let chunk = &mut self.chunk;
@@ -102,7 +102,7 @@ impl<W: Write> File<W> {
         let mut chunk = std::mem::take(&mut self.chunk);
         let size = chunk.records.len() as u64;
         let (start, times) = (self.written, Fields::default().u64(chunk.first_ns).u64(chunk.last_ns));
-        // Without a checksum, and without compression.
+        // No checksum and no compression.
         let head = times.u64(size).u32(0).text("").u64(size).0;
         self.write(&[Op::Chunk as u8])?;
         self.write(&(head.len() as u64 + size).to_le_bytes())?;
@@ -117,7 +117,7 @@ impl<W: Write> File<W> {
             self.record(Op::MessageIndex, &Fields::default().u16(*channel).bytes(&entries.0).0)?;
         }
         let indexes = self.written - indexes_start;
-        // Its memory serves the next one.
+        // The memory is reused for the next chunk.
         chunk.records.clear();
         chunk.messages.values_mut().for_each(Vec::clear);
         let index = Fields::default().u64(chunk.first_ns).u64(chunk.last_ns).u64(start).u64(length);
@@ -152,7 +152,7 @@ impl<W: Write> File<W> {
         self.write(&MAGIC)
     }
 
-    /// Records of one kind, and where they are; none where there are none.
+    /// Writes a group of records of one kind; returns its position, `None` if it is empty.
     fn group<'a>(&mut self, op: Op, records: impl Iterator<Item = &'a [u8]>) -> io::Result<Option<(Op, u64, u64)>> {
         let start = self.written;
         for record in records {
@@ -173,7 +173,7 @@ impl<W: Write> File<W> {
     }
 }
 
-/// The fields of a record, one behind the other.
+/// The fields of a record, one after the other.
 #[derive(Default)]
 struct Fields(Vec<u8>);
 

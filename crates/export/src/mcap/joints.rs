@@ -1,4 +1,4 @@
-//! Where the joints are, from what was commanded: along a trajectory at its own points, straight between two of them.
+//! Joint positions as commanded: at the points of a trajectory, linear between two of them.
 
 use crate::wire::foxglove::JointState;
 use ratn_executive::protocol::LogLine;
@@ -6,20 +6,20 @@ use ratn_model::id::InstanceId;
 use ratn_report::motions::{Change, Motions, Way, place};
 use std::collections::BTreeMap;
 
-/// How far apart two messages are at the least; a planner's points may be closer.
+/// Minimum time between two messages; a planner's points may be closer.
 const PERIOD_S: f64 = 0.02;
 
 /// The motions under way.
 #[derive(Debug, Default)]
 pub(super) struct Joints {
     motions: Motions,
-    /// Of each motion along a trajectory the next moment to be told.
+    /// For each motion along a trajectory, the time of the next message.
     next_s: BTreeMap<InstanceId, f64>,
     due: Vec<(f64, Vec<JointState>)>,
 }
 
 impl Joints {
-    /// What a line says of motions.
+    /// Applies a line.
     pub(super) fn follow(&mut self, line: &LogLine) {
         match self.motions.follow(line) {
             Some(Change::Begins(instance, motion)) => {
@@ -27,19 +27,19 @@ impl Joints {
             }
             Some(Change::Ends(instance, motion, end)) => {
                 self.next_s.remove(&instance);
-                // The names of the joints are those of the trajectory.
+                // Joint names come from the trajectory.
                 if let (Way::Along(trajectory), Some(positions)) = (&motion.way, end)
                     && trajectory.joints.len() == positions.len()
                 {
                     self.due.push((line.at.seconds(), states(&trajectory.joints, positions, &[])));
                 }
             }
-            // What has no trajectory has no names for its joints.
+            // Without a trajectory there are no joint names.
             Some(Change::Stands { .. } | Change::Looks { .. } | Change::Fingers { .. }) | None => {}
         }
     }
 
-    /// Every position up to a moment that was not told yet, in order.
+    /// Every position up to `at_s` that was not returned yet, in order.
     pub(super) fn until(&mut self, at_s: f64) -> Vec<(f64, Vec<JointState>)> {
         let mut all = std::mem::take(&mut self.due);
         for (instance, motion) in self.motions.under_way() {

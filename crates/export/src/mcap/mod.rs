@@ -1,8 +1,8 @@
-//! A recording for Foxglove and Rerun, in Foxglove's schemas: what happened (`/log`, and `/event_log` line by line as JSON), the objects as
-//! believed (`/scene`), where the base stands (`/tf`), and the joints (`/joint_states`).
+//! A recording for Foxglove and Rerun, in Foxglove's schemas: log messages (`/log`, and `/event_log` line by line as JSON), the objects as
+//! believed (`/scene`), the pose of the base (`/tf`), and the joints (`/joint_states`).
 //!
-//! Joints are where the log has them: along the trajectories that were given to be followed, and at the ends that drivers told. They are
-//! as commanded, not as measured. The robot itself is its URDF, which the viewer is given.
+//! Joint positions are those in the log: along the commanded trajectories, and at the final positions that drivers reported. They are
+//! commanded, not measured. The robot itself is its URDF, which the viewer has to be given.
 
 mod file;
 mod joints;
@@ -20,12 +20,12 @@ use ratn_report::timeline::{Changed, Timeline};
 use scene::Shown;
 use std::io::{self, Write};
 
-/// Whatever else a line of an event log says, it is one object.
+/// The schema of a line of an event log: an object with at least `at`.
 const LINE_SCHEMA: &str =
     r#"{"title":"ratn.LogLine","type":"object","properties":{"at":{"type":"integer"}},"required":["at"]}"#;
 
 pub(crate) struct Mcap<W> {
-    /// None until the first line.
+    /// `None` until the first line.
     file: Option<(File<W>, Topics)>,
     out: Option<W>,
     believed: Shown,
@@ -112,7 +112,7 @@ impl<W: Write> Writer for Mcap<W> {
     }
 }
 
-/// What people read of a line.
+/// The message for people that a line gives.
 fn said(line: &LogLine, run: &Timeline) -> Option<(Level, String)> {
     let path = |id| run.instance(id).map_or_else(|| format!("{id}"), |one| one.path.to_string());
     Some(match &line.entry {

@@ -1,4 +1,4 @@
-//! The objects as the task believes them, as a viewer draws them.
+//! The objects as the task believes them, in the form that a viewer draws.
 
 use crate::wire::foxglove::{
     Color, CubePrimitive, CylinderPrimitive, FrameTransform, FrameTransforms, Pose, Quaternion, SceneEntity,
@@ -9,17 +9,17 @@ use ratn_executive::protocol::LogLine;
 use ratn_report::believed::Believed;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 
-/// Frames: of the world, of the robot's base, and of what the gripper holds.
+/// Coordinate frames: of the world, of the robot's base, and of the tool that holds objects.
 const WORLD: &str = "world";
 const BASE: &str = "base";
-/// Where the URDF calls its tool otherwise, what is held is not shown.
+/// If the URDF has another name for its tool, held objects are not shown.
 const TOOL: &str = "tool";
 const GREY: Color = Color { r: 0.55, g: 0.6, b: 0.68, a: 0.6 };
 const BLUE: Color = Color { r: 0.25, g: 0.5, b: 0.85, a: 1.0 };
-/// What has an edge as long as this is furniture.
+/// An object with an edge at least this long is drawn as furniture.
 const FURNITURE_M: f64 = 0.5;
 
-/// What was shown of the world as the run believes it.
+/// What was shown of the world as believed by the run.
 #[derive(Debug, Default)]
 pub(super) struct Shown {
     believed: Believed,
@@ -27,12 +27,12 @@ pub(super) struct Shown {
 }
 
 impl Shown {
-    /// Whether a line says something of the root world.
+    /// Whether a line changes the root world.
     pub(super) fn follow(&mut self, line: &LogLine) -> bool {
         self.believed.follow(line)
     }
 
-    /// What is otherwise than was shown. A world that makes no scene, because a fact has another form, shows nothing new.
+    /// The changes since the last update. A world that yields no scene, because a fact has another form, gives no update.
     pub(super) fn update(&mut self, at: Timestamp) -> Option<SceneUpdate> {
         let scene = self.believed.scene()?;
         let before = self.scene.as_ref().map_or(&[][..], |shown| &shown.objects);
@@ -47,7 +47,7 @@ impl Shown {
         (is_new || !update.deletions.is_empty() || !update.entities.is_empty()).then_some(update)
     }
 
-    /// Where the base stands.
+    /// The pose of the base.
     pub(super) fn base(&self, at: Timestamp) -> Option<FrameTransforms> {
         let base = self.scene.as_ref()?.base;
         Some(FrameTransforms {
@@ -65,7 +65,7 @@ impl Shown {
 fn entity(object: &SceneObject, at: Timestamp) -> SceneEntity {
     let (frame, pose) = match object.placement {
         Placement::World(pose) => (WORLD, pose),
-        // One tool has a frame there, whoever holds it.
+        // There is only one tool frame, whichever arm holds the object.
         Placement::Gripper(pose) | Placement::Hand { pose, .. } => (TOOL, pose),
     };
     let pose =

@@ -78,7 +78,7 @@ if typing.TYPE_CHECKING:
     from ratn._trace import State
     from ratn._views import Chart, CriticalPath, Log, Network, Nodes, Report, Why
 
-# What tasks and systems need is read when it is asked for: a worker needs none of it, and there are many workers.
+# The modules for tasks and systems are loaded on first use: a worker needs none of them, and there are many workers.
 _LATER = {
     "_annotations": "Annotations block consume create delete output",
     "_blocks": "collect concurrently do_while each lastly otherwise retry sequence until when while_",
@@ -94,7 +94,7 @@ _PLACES = {name: module for module, names in _LATER.items() for name in names.sp
 
 
 def __getattr__(name: str) -> typing.Any:
-    """Of a name that is not read yet: PEP 562."""
+    """Loads a name on first use (PEP 562)."""
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f"{__name__}.{_PLACES[name]}"), name)
@@ -106,7 +106,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-# What `protoc` makes of the protocol's files is `ratn.v1`, in a folder of its own.
+# The Python modules that `protoc` generates from the protocol's files are `ratn.v1`, in a folder of their own.
 __path__ = pkgutil.extend_path(__path__, __name__)
 
 __all__ = [

@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def _write(text: str) -> None:
-    """Source text is UTF-8, whatever the terminal's locale is."""
+    """Writes source text as UTF-8, whatever the terminal's locale is."""
     sys.stdout.buffer.write(text.encode())
     sys.stdout.flush()
 

@@ -1,4 +1,4 @@
-"""What is said of a state beside what it is: keyword arguments in Python, keys in a task file."""
+"""Annotations of states: keyword arguments in Python, keys in a task file."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ class Annotations(typing.TypedDict, total=False):
     shared: Sequence[str | Value]
 
 
-#: Keys of a state beside those that say what it is, as keyword arguments.
+#: Annotation keys of a state, as keyword arguments.
 ANNOTATIONS = (
     *(key for key in Annotations.__annotations__ if key not in ("name", "inputs")),
     "outcomes", "variables", "outputs", "routine", "decide",
 )
-#: Annotations that are expressions, or have some within: a text of Python is a text there, and not an expression.
+#: Annotations that are expressions, or contain some: a Python text there is a string value, and not an expression.
 VALUES = {"duration", "variables", "assign", "outputs", "decide"}
 
 _KEYS = {name: key for key, name in _source.RENAMED.items()}
 
 def entry(value: object) -> Any:
-    """A value of Python where a task file has an expression."""
+    """A Python value at a place where a task file has an expression."""
     if value is None or isinstance(value, bool):
         return value
     if isinstance(value, (int, float)) and not hasattr(value, "tolist"):
@@ -63,7 +63,7 @@ def entry(value: object) -> Any:
 
 
 def raw(value: object) -> Any:
-    """What is in a task file's own words: texts as they are, values as their expressions, states as their names."""
+    """A value at a place where a task file has plain words: texts as they are, values as their expressions, states as their names."""
     if isinstance(value, State):
         return Trace.now("a state in `transitions`").leads_to(value._node)
     if isinstance(value, Value):
@@ -80,7 +80,7 @@ def raw(value: object) -> Any:
 
 
 def annotate(body: dict[str, Any], said: dict[str, Any]) -> None:
-    """Adds annotations, as keyword arguments say them."""
+    """Adds annotations from keyword arguments."""
     for key, value in said.items():
         if key not in ANNOTATIONS:
             known = ", ".join(ANNOTATIONS)
@@ -102,7 +102,7 @@ def outputs_said(outputs: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass
 class Output:
-    """An output with a type, and what it is where it was not written: ``ratn.output(n, type="int")``."""
+    """An output with a type, and with a default for the case that it was not written: ``ratn.output(n, type="int")``."""
 
     value: object
     type: str | None = None

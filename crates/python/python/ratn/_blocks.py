@@ -1,4 +1,4 @@
-"""States with states inside, as ``with`` blocks and loops."""
+"""States that contain other states, as ``with`` blocks and loops."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ratn._trace import AnyState, Node, Port, Trace, assigned_name, calls
 
 
 class Block(AnyState):
-    """A ``with`` block: a state with states inside."""
+    """A ``with`` block: a state that contains other states."""
 
     __slots__ = ("_branch", "_trace")
     _FORM: str = "states"
-    #: What it is called where nobody says so: there are forms that have a name.
+    #: The default name of the block; some kinds of blocks have one.
     _IMPLIED: str | None = None
 
     def __init__(self, function: str, name: str | None, annotations: dict[str, Any], head: dict[str, Any], default: str) -> None:
@@ -39,7 +39,7 @@ class Block(AnyState):
             self._trace.leave(self._node)
 
     def _say(self, key: str, said: dict[str, Any]) -> None:
-        """Something about what is inside, said inside or after it."""
+        """Sets a property of the block, inside it or after it."""
         is_open = {id(states) for states, _ in self._trace.open}
         lists = [(states, self._node) for branch, states in self._node.branches.items() if branch != "finally"]
         depth = len(self._trace.open)
@@ -50,24 +50,24 @@ class Block(AnyState):
             del self._trace.open[depth:]
 
     def outputs(self, **outputs: Any) -> None:
-        """What is seen of it outside: ``think.outputs(way=plan.trajectory)``. What is used outside is seen without that, too."""
+        """Adds outputs of the block: ``think.outputs(way=plan.trajectory)``. Values that are used outside become outputs without that, too."""
         self._say("outputs", outputs)
 
 
 class Ordered(Block):
-    """States in order, as one state."""
+    """A sequence of states, as one state."""
 
     __slots__ = ()
 
 
 class Retry(Ordered):
-    """What is tried again. A block of one action, without ``name=``, is that action with a ``retry``."""
+    """A block with retries. A block of one action, without ``name=``, becomes that action with a ``retry``."""
 
     __slots__ = ("_is_named",)
     _is_named: bool
 
     def before(self) -> _Before:
-        """What is done before each further try: ``with attempt.before():``."""
+        """The states before each further attempt: ``with attempt.before():``."""
         return _Before(self._trace, self._node)
 
     def __exit__(self, kind: object, *exception: object) -> None:
@@ -96,7 +96,7 @@ class _Before:
         if node.before is not None:
             refuse("there is a `before` of this retry already", "put all that is done before another try into one block")
         node.before = []
-        # It is not inside of what is tried again, and sees nothing of it.
+        # This list is not inside the block with retries, and sees nothing of it.
         at = next((index for index, (_, owner) in enumerate(trace.open) if owner is node), len(trace.open))
         self._outside, trace.open[at:] = trace.open[at:], [(node.before, node)]
 
@@ -106,18 +106,18 @@ class _Before:
 
 
 class Condition(Block):
-    """What is done where something is true; :func:`otherwise` is the other branch."""
+    """A condition: the states that run if it is true; :func:`otherwise` is the other branch."""
 
     __slots__ = ()
     _FORM = "then"
 
 
-#: What a loop binds beside its element.
+#: The variable that a loop binds in addition to its element.
 _NUMBER = "number of the iteration"
 
 
 class Loop(Block):
-    """What is done again and again."""
+    """A loop."""
 
     __slots__ = ("_key", "_index")
     _FORM = "do"
@@ -125,7 +125,7 @@ class Loop(Block):
     _index: str | None
 
     def test(self, condition: object) -> None:
-        """The condition, said inside: it may speak of the states in the loop."""
+        """The condition, set inside the loop: it may use the states of the loop."""
         self._node.body[self._key] = _condition(condition)
 
     @property
@@ -143,14 +143,14 @@ class Loop(Block):
 
 
 class Concurrency(Block):
-    """Regions that run at the same time: each state inside is one."""
+    """Concurrent regions: each state inside is one."""
 
     __slots__ = ()
     _FORM = "regions"
     _IMPLIED = "concurrently"
 
     def decide(self, **outcomes: Any) -> None:
-        """Its outcome is the first whose condition holds: ``both.decide(blind=head.outcome == "aborted")``."""
+        """Sets how the outcome is decided: the first one whose condition holds: ``both.decide(blind=head.outcome == "aborted")``."""
         self._say("decide", outcomes)
 
 

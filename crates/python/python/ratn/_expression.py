@@ -25,8 +25,8 @@ from ratn._ratn import Aborted, Cancelled, Error, Joints, Lost, Pose
 _PACKAGE = os.path.dirname(os.path.abspath(__file__)) + os.sep
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 KEYWORDS = {"or", "and", "not", "in", "exists", "true", "false", "null"}
-#: Stands around the number of a value in an f-string, and is not seen itself where it is printed: the value is written down where the text is used, as it is
-#: there, and refused where a text is no expression. Where nothing stands between two, the text behind them is that of a value that is the same everywhere.
+#: An invisible character around the number of a value in an f-string. The value is written when the text is used, in the form for that place; it is refused
+#: in a text that is no expression. If there is nothing between two of them, the text after them is that of a value that is the same everywhere.
 _MARK = "\u2063"
 _MARKED = re.compile(f"{_MARK}(?:<value_([0-9]+)>)?{_MARK}")
 
@@ -36,7 +36,7 @@ class Untraceable(Error):
 
 
 def user_frame() -> types.FrameType:
-    """The frame of the user's code that is at work."""
+    """The frame of the user's code that is running."""
     frame: types.FrameType | None = sys._getframe(1)
     while frame is not None and os.path.abspath(frame.f_code.co_filename).startswith(_PACKAGE):
         frame = frame.f_back
@@ -54,7 +54,7 @@ _TREES: dict[str, tuple[int, ast.Module | None]] = {}
 
 
 def _tree(file: str) -> ast.Module | None:
-    """The source of a file, parsed, where there is one: also a cell of a notebook."""
+    """The parsed source of a file, if there is one; also of a notebook cell."""
     linecache.checkcache(file)
     lines = linecache.getlines(file)
     text = "".join(lines)
@@ -69,7 +69,7 @@ def _tree(file: str) -> ast.Module | None:
 
 
 def statements_at_work(file: str, line: int) -> list[ast.AST]:
-    """What stands at a line, the innermost first."""
+    """The statements at a line, the innermost first."""
     tree = _tree(file)
     if tree is None:
         return []
@@ -82,7 +82,7 @@ def statements_at_work(file: str, line: int) -> list[ast.AST]:
 
 
 def function_at(file: str, line: int, name: str) -> ast.FunctionDef | None:
-    """The function of a name that begins at a line, with its decorators."""
+    """The function of this name that begins at a line, with its decorators."""
     tree = _tree(file)
     for node in () if tree is None else ast.walk(tree):
         if isinstance(node, ast.FunctionDef) and node.name == name and min(map(_begins, [node, *node.decorator_list])) == line:
@@ -109,7 +109,7 @@ def _jump(body: Sequence[ast.AST], is_in_loop: bool) -> tuple[str, int] | None:
         is_loop = isinstance(node, (ast.For, ast.AsyncFor, ast.While))
         for name, part in ast.iter_fields(node):
             if isinstance(part, list) and part and isinstance(part[0], ast.AST):
-                # Behind a loop's `else` it is left as well.
+                # A jump in the `else` of a loop leaves the block as well.
                 found = _jump(part, (is_loop and name == "body") or is_in_loop)
                 if found is not None:
                     return found
@@ -117,7 +117,7 @@ def _jump(body: Sequence[ast.AST], is_in_loop: bool) -> tuple[str, int] | None:
 
 
 def handler_of(file: str, line: int, names: Mapping[str, object]) -> tuple[str, int] | None:
-    """What an ``except`` around a line catches of the exceptions that end an action (``ratn.Aborted``), and its line; ``names`` are those known there."""
+    """The first exception that ends an action (``ratn.Aborted``) and is caught by an ``except`` around a line, and its line. ``names`` are those known there."""
     for node in statements_at_work(file, line):
         if isinstance(node, ast.Try) and any(_begins(one) <= line <= _ends(one) for one in node.body):
             for handler in node.handlers:
@@ -130,7 +130,7 @@ def handler_of(file: str, line: int, names: Mapping[str, object]) -> tuple[str, 
 
 
 def _named(text: str, names: Mapping[str, object]) -> object:
-    """What a name with attributes is."""
+    """The object that a dotted name refers to."""
     first, *rest = text.split(".")
     found = names.get(first)
     for name in rest:
@@ -155,7 +155,7 @@ def refuse(what: str, instead: str, at: tuple[str, int] | None = None) -> NoRetu
 
 
 def _truth_wanted() -> NoReturn:
-    """Something asks whether a value is true; what that is decides about what to write instead."""
+    """Refuses a truth test of a value; the message depends on what makes the test."""
     file, line = user_line()
     what, instead = "Python asks whether this is true, which is known only while the task runs", "write `with ratn.when(condition):`"
     for node in statements_at_work(file, line):
@@ -189,18 +189,18 @@ def _truth_wanted() -> NoReturn:
 
 
 def plain(part: object) -> str:
-    """A part of an expression as it is written at the place that is being traced."""
+    """A part of an expression, written for the place that is being traced."""
     text: str = part if isinstance(part, str) else part._text()  # type: ignore[attr-defined]
     return text
 
 
 def expression(value: object) -> str:
-    """A value of Python as the text of an expression."""
+    """Writes a Python value as the text of an expression."""
     return plain(written(value))
 
 
 def parts_of(text: str) -> list[object]:
-    """A text that is in the words of task files, as texts and the values that f-strings in it name."""
+    """Splits a text in the language of task files into texts and the values that f-strings in it name."""
     parts: list[object] = []
     for index, part in enumerate(_MARKED.split(str.__str__(text))):
         if not part:
@@ -217,12 +217,12 @@ def parts_of(text: str) -> list[object]:
 
 
 def words(text: str) -> str:
-    """A text that is in the words of task files, as it is written at the place that is being traced: an f-string in it names values."""
+    """A text in the language of task files, written for the place that is being traced: an f-string in it may name values."""
     return "".join(map(plain, parts_of(text)))
 
 
 def _shown(text: str) -> str:
-    """A text for people."""
+    """A text in the form for people."""
     try:
         return words(text)
     except Untraceable:
@@ -230,18 +230,18 @@ def _shown(text: str) -> str:
 
 
 def literal(text: str, what: str = "a text") -> str:
-    """A text that is what it says, and no expression."""
+    """A literal text, which is no expression."""
     if _MARK in text:
         refuse(
             f"{what} with a value in it that is known only while the task runs, `{_shown(text)}`",
             'write `fn.concat("…", value)`; an f-string names values only in annotations, conditions and `ratn.expr`',
         )
-    # What a member of an enumeration says of itself is another text than its value.
+    # `str()` of an enumeration member differs from its value.
     return str.__str__(text)
 
 
 def _quoted(text: str) -> str:
-    """A text as an expression has it, which knows fewer escapes than JSON: what else there is stands for itself."""
+    """A text quoted for an expression, which has fewer escapes than JSON: all other characters are written as they are."""
     for sign, escaped in (("\\", "\\\\"), ('"', '\\"'), ("\n", "\\n"), ("\t", "\\t")):
         text = text.replace(sign, escaped)
     return f'"{text}"'
@@ -252,7 +252,7 @@ def _field(name: str) -> str:
 
 
 def key_of(name: object, what: str = "a name") -> str:
-    """A name in a map."""
+    """A key of a map."""
     if isinstance(name, int) and not isinstance(name, bool):
         return int.__repr__(name)
     return literal(name if isinstance(name, str) else str(name), what)
@@ -425,7 +425,7 @@ class Value:
 
 
 class Binding:
-    """A variable of a task file: who binds it. Written down where another one of its name hides it, it is refused."""
+    """A variable of a task file, with the state that binds it. At a place where another variable of the same name hides it, its use is refused."""
 
     def __init__(self, name: str, kind: str, line: tuple[str, int]) -> None:
         self.name, self.kind, self.line = name, kind, line
@@ -454,13 +454,13 @@ class Binding:
 
 
 class TaskFunctionScope:
-    """Around the body of a function of the task: it sees nothing of what is around."""
+    """The scope of a function of the task: it sees nothing of the surrounding scopes."""
 
     def __init__(self, name: str) -> None:
         self.name = name
 
 
-#: What is bound by functions of elements and of the task that are being written down, the innermost last.
+#: The bindings of element functions and task functions that are being written, the innermost last.
 _bound: contextvars.ContextVar[tuple[Binding | TaskFunctionScope, ...]] = contextvars.ContextVar("ratn_bound", default=())
 
 
@@ -474,12 +474,12 @@ def binding(*inner: Binding | TaskFunctionScope) -> Iterator[None]:
 
 
 def scope_of_function() -> str | None:
-    """The function of the task whose body is being written down."""
+    """The scope of the task function whose body is being written."""
     return next((inner.name for inner in reversed(_bound.get()) if isinstance(inner, TaskFunctionScope)), None)
 
 
 class Within:
-    """An expression of an element, where that is bound."""
+    """An expression that uses an element, at places where the element is bound."""
 
     def __init__(self, element: Binding, value: object) -> None:
         self.element, self.value = element, value
@@ -490,7 +490,7 @@ class Within:
 
 
 class Variable(Value):
-    """A parameter, a scoped variable, or what a loop binds: ``$name``."""
+    """A parameter, a scoped variable, or a loop's variable: ``$name``."""
 
     __slots__ = ()
 
@@ -527,7 +527,7 @@ class Variable(Value):
 
 
 def within(part: object) -> object:
-    """An operand, in parentheses where it has to be."""
+    """Writes an operand, in parentheses if needed."""
     if isinstance(part, Value) and part._is_atom:
         return part
     if isinstance(part, Value):
@@ -537,7 +537,7 @@ def within(part: object) -> object:
 
 
 def written(value: object) -> object:
-    """A value of Python as a part of an expression."""
+    """Writes a Python value as a part of an expression."""
     if isinstance(value, Value):
         return value
     if getattr(type(value), "_is_state", False):
@@ -573,7 +573,7 @@ def written(value: object) -> object:
 def _whole_number(number: int) -> str:
     if not -(2**63) <= number < 2**63:
         refuse(f"{number} is no number of a task", "use whole numbers of at most 64 bits, or floats")
-    # What stands behind the sign would be too large by itself.
+    # The number without its sign would be too large.
     return int.__repr__(number) if number > -(2**63) else f"({number + 1} - 1)"
 
 
@@ -588,7 +588,7 @@ def _roll_pitch_yaw(pose: Pose) -> tuple[float, float, float]:
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
     yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     if abs(pitch) > math.pi / 2 - 1e-6:
-        # Only the difference of both others counts there.
+        # At this pitch only the difference of roll and yaw matters.
         roll, yaw = 0.0, -2 * math.copysign(1, pitch) * math.atan2(x, w)
     return (round(roll, 15), round(pitch, 15), round(yaw, 15))
 
@@ -601,7 +601,7 @@ def _joined(parts: Iterable[object]) -> list[object]:
 
 
 def call(function: str, *arguments: object) -> Value:
-    """A function of expressions applied to values."""
+    """A call of an expression function."""
     return Value(f"{function}(", *_joined(written(argument) for argument in arguments), ")")
 
 
@@ -653,7 +653,7 @@ def _applied(name: str, arguments: tuple[object, ...]) -> Value:
     if name == "either":
         from ratn._trace import Either
 
-        # Where it is written down depends on where the states are that give the values.
+        # Its text depends on where the states are that give the values; this is known when the expression is written.
         return Value(Either(arguments))
     if name not in _OF_ELEMENTS:
         return call(name, *arguments)

@@ -1,9 +1,8 @@
-"""Comparisons that Python decides without asking anybody: ``value is None`` is false for whatever is known only while the task runs, and no object can refuse it.
-They are looked for in the source of a task's function, before that is called.
+"""Refuses identity comparisons in tasks: ``value is None`` is always false for a value that is known only while the task runs, and no object can overload ``is``.
+Such comparisons are searched in the source of a task's function, before it is called.
 
-Refused is what is such a value for sure: a parameter of the task, what ``ratn.each`` binds, an output of a state, what an expression makes of these; under
-a name where everything that gives the name a value is such a value. What else Python may have put there (a plain function that returns ``None`` at times) is
-left alone.
+Only comparisons of certain values are refused: a parameter of the task, the variable of ``ratn.each``, an output of a state, an expression of these; and a
+name if everything assigned to it is such a value. Anything else (for example the result of a plain function that may return ``None``) is left alone.
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ from ratn._expression import Functions, function_at, refuse
 from ratn._step import Step
 
 _Kind = Literal["value", "state"]
-#: Calls that make a state, and those that make a value.
+#: Calls that make a state, and calls that make a value.
 _STATES = (_states.wait, _states.ask, _states.action, _states.library)
 _VALUES = (_expression.fact, _expression.expr, _expression.exists, _expression.isin, _states.variable, _blocks.collect)
 _MAKE_VALUES = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.MatMult, ast.BitAnd, ast.BitOr)
 
 
 def refuse_identity(function: Callable[..., Any]) -> None:
-    """Refuses the first comparison by identity of a value that is known only while the task runs. Without its source it refuses nothing."""
+    """Refuses the first identity comparison of a value that is known only while the task runs. Without the function's source nothing is refused."""
     code = function.__code__
     node = function_at(code.co_filename, code.co_firstlineno, code.co_name)
     if node is None:
@@ -40,7 +39,7 @@ def refuse_identity(function: Callable[..., Any]) -> None:
 
 
 def _captured(function: Callable[..., Any]) -> dict[str, Any]:
-    """What a function uses of those that it stands in, as far as that is there already."""
+    """The variables that a function captures from its enclosing functions, as far as they are set already."""
     captured = {}
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or ()):
         try:
@@ -51,13 +50,13 @@ def _captured(function: Callable[..., Any]) -> dict[str, Any]:
 
 
 class _Function:
-    """The source of a function, with what gives each of its names a value."""
+    """The source of a function, with the values given to each of its names."""
 
     def __init__(self, node: ast.FunctionDef, names: Mapping[str, Any]) -> None:
         self.node, self.names = node, names
-        #: What is surely given to a name: an expression, or a kind.
+        #: What is certainly given to a name: an expression, or a kind.
         self.given: dict[str, list[ast.expr | _Kind]] = {}
-        #: How often a name is bound, by whatever binds names.
+        #: How often a name is bound, in any way.
         self.bound: dict[str, int] = {}
         self.asked: set[str] = set()
         own = {id(argument) for argument in ast.walk(node.args) if isinstance(argument, ast.arg)}
@@ -90,7 +89,7 @@ class _Function:
                     self._gives(argument.arg, "value")
 
     def compared(self) -> Iterator[tuple[str, str, int]]:
-        """Each comparison by identity with `None` or a truth: its text, the condition that is meant, and its line."""
+        """Each identity comparison with `None` or a boolean: its text, the intended condition, and its line."""
         for part in ast.walk(self.node):
             if isinstance(part, ast.Compare):
                 sides = [part.left, *part.comparators]
@@ -107,7 +106,7 @@ class _Function:
                             yield f"case {ast.unparse(pattern)}", _condition(part.subject, pattern.value, True), pattern.lineno
 
     def _kind(self, node: ast.expr) -> _Kind | None:
-        """Whether it is surely a value, or surely a state."""
+        """Whether an expression is certainly a value, or certainly a state."""
         if isinstance(node, ast.Name):
             return self._kind_of_name(node.id)
         if isinstance(node, ast.NamedExpr):
@@ -137,7 +136,7 @@ class _Function:
         return kinds.pop() if len(kinds) == 1 else None
 
     def _called(self, node: ast.expr) -> object:
-        """What is called, as far as it is the package's; `Functions` for one of expressions, the provider for an action of it."""
+        """The called object if it belongs to the package; `Functions` for an expression function, the provider for one of its actions."""
         if isinstance(node, ast.Name):
             return None if node.id in self.bound else self.names.get(node.id)
         if not isinstance(node, ast.Attribute):
@@ -158,7 +157,7 @@ def _condition(value: ast.expr, other: bool | None, is_same: bool) -> str:
 
 
 def _bound_by(part: ast.AST) -> list[str]:
-    """The names that something binds."""
+    """The names that a statement binds."""
     if isinstance(part, ast.Name):
         return [] if isinstance(part.ctx, ast.Load) else [part.id]
     if isinstance(part, ast.arg):

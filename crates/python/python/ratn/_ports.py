@@ -44,7 +44,7 @@ _SIMPLE = {
 
 @dataclass
 class Action:
-    """An action as the native part takes it."""
+    """An action in the form that the native part takes."""
 
     name: str
     description: str
@@ -71,7 +71,7 @@ def where(function: Callable[..., Any]) -> str:
 
 
 def is_array(annotation: Any) -> bool:
-    """Whether numpy's arrays are meant; numpy is not imported for it."""
+    """Whether a type means numpy arrays; does not import numpy."""
     numpy = sys.modules.get("numpy")
     origin = typing.get_origin(annotation) or annotation
     if origin is typing.Annotated or hasattr(annotation, "__metadata__"):
@@ -112,7 +112,7 @@ def type_of(annotation: Any) -> str:
 
 
 def inputs_of(function: Callable[..., Any]) -> tuple[list[tuple[str, str, bool, Any]], set[str]]:
-    """The inputs: all parameters but the first, which is the goal; and those that are given as arrays."""
+    """The inputs: all parameters but the first, which is the goal; and the names of those that are passed as arrays."""
     place = where(function)
     hints = typing.get_type_hints(function, include_extras=True)
     parameters = list(inspect.signature(function).parameters.values())
@@ -135,7 +135,7 @@ def inputs_of(function: Callable[..., Any]) -> tuple[list[tuple[str, str, bool, 
 
 
 def outputs_of(function: Callable[..., Any], said: dict[str, Any] | None) -> list[tuple[str, str]]:
-    """The outputs: as said, else the fields of the ``TypedDict`` that is returned, else the names in the function's ``return {…}``."""
+    """The outputs: as declared, else the fields of the returned ``TypedDict``, else the names in the function's ``return {…}``."""
     if said is not None:
         return [(name, kind if isinstance(kind, str) else type_of(kind)) for name, kind in said.items()]
     returned = typing.get_type_hints(function, include_extras=True).get("return")
@@ -174,7 +174,7 @@ def _returned_names(function: Callable[..., Any]) -> list[str]:
 
 
 def _own_nodes(function: ast.AST) -> typing.Iterator[ast.AST]:
-    """What is within a function and within no other one inside it."""
+    """The syntax nodes of a function, without those of functions inside it."""
     waiting = list(ast.iter_child_nodes(function))
     while waiting:
         node = waiting.pop()
@@ -184,7 +184,7 @@ def _own_nodes(function: ast.AST) -> typing.Iterator[ast.AST]:
 
 
 def fitting(value: Any, kind: str) -> Any:
-    """An output as its port wants it: numbers as joints, an array as bytes."""
+    """An output converted to its port's type: numbers to joints, an array to bytes."""
     if kind == "joints" and not isinstance(value, Joints) and hasattr(value, "__len__"):
         return Joints(value)
     if kind == "bytes" and hasattr(value, "tobytes"):

@@ -1,4 +1,4 @@
-"""The resources of states that say none: they block what performs their action, as ``arm.follow(…)`` of a module of actions does."""
+"""Adds the resources of states that declare none: they block the provider of their action, as ``arm.follow(…)`` of an actions module does."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from ratn import _ratn, _source
 from ratn._annotations import VALUES
 from ratn._ratn import Error
 
-#: An action as `ratn actions --json` lists it, by `provider/action`.
+#: Actions in the form of `ratn actions --json`, by `provider/action`.
 Offers = dict[str, dict[str, Any]]
 
 
 @cache
 def of_catalogues(*catalogues: str) -> Offers:
-    """The actions of the built-in catalogue and of others, which are TOML."""
+    """The actions of the built-in catalogue and of further ones in TOML."""
     providers = json.loads(_ratn.catalogue(list(catalogues)))["providers"]
     return {
         f"{name}/{action}": {"resource": provider["resource"], **signature} for name, provider in providers.items() for action, signature in provider["actions"].items()
@@ -25,7 +25,7 @@ def of_catalogues(*catalogues: str) -> Offers:
 
 
 def of_system(runtime_dir: object, config: object = None) -> Offers:
-    """The actions of a system that runs, of which its workers say what they are, or of a config."""
+    """The actions of a running system, whose workers describe themselves, or of a config."""
     from ratn._system import _told
 
     words = ["actions", "--json"]
@@ -38,7 +38,7 @@ def of_system(runtime_dir: object, config: object = None) -> Offers:
 
 
 def block_what_performs(value: Any, offers: Callable[[str], dict[str, Any] | None], around: frozenset[str] = frozenset()) -> None:
-    """Adds the resources of states that say none, here and inside, unless a state around them blocks what performs them. `offers` is asked for actions."""
+    """Adds resources to states without any, at all depths, unless an outer state blocks the provider. `offers` is called for the actions."""
     if isinstance(value, list):
         for item in value:
             block_what_performs(_source.named(item)[1] if isinstance(item, dict) else item, offers, around)
@@ -51,13 +51,13 @@ def block_what_performs(value: Any, offers: Callable[[str], dict[str, Any] | Non
             value["resources"] = resources(offer["resource"], {**said, **value})
     around |= _blocked(value.get("resources"))
     for key, inside in value.items():
-        # What is an expression, or has some within, is no state.
+        # Expressions, and values that contain some, are no states.
         if key not in ("in", "with", *VALUES):
             block_what_performs(inside, offers, around)
 
 
 def resources(kind: str, said: dict[str, Any]) -> list[str]:
-    """What a state blocks that is performed by one of a kind: that, and room for a projection where it computes and reads the world."""
+    """The resources of a state whose action a provider of this kind performs: the provider, and room for a projection if it computes and reads the world."""
     return [kind, "world_model"] if said.get("computes") is True and said.get("reads") != [] else [kind]
 
 

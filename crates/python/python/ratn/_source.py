@@ -11,17 +11,17 @@ import re
 from typing import Any
 
 _INDENT = "    "
-#: Keys of a task file that are words of Python's own, and what they are called here.
+#: Keys of a task file that are Python keywords, with their names here.
 RENAMED = {"while": "holds"}
 _ACTION_KEYS = ("action", "in")
 _NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?\Z")
 _TASK_KEYS = ("description", "horizon", "speculation_width", "deadline", "exceptions", "ontology", "tolerance", "world", "outcomes", "variables", "functions")
-#: Keys whose values are expressions: what is text there is one.
+#: Keys whose values are expressions: a text there is an expression.
 _EXPRESSIONS = ("variables", "assign", "outputs", "decide", "duration")
 
 
 def python_of(document: dict[str, Any]) -> str:
-    """The text of a module with the task as a function."""
+    """The source text of a module with the task as a function."""
     source = _Source()
     source.task(document)
     head = ["from typing import Annotated", ""] if any("Annotated[" in line for line in source.lines) else []
@@ -29,7 +29,7 @@ def python_of(document: dict[str, Any]) -> str:
 
 
 def _expression(value: Any) -> str:
-    """What gives the same expression again."""
+    """Python source that gives the same expression again."""
     if isinstance(value, str):
         return f"expr({value!r})"
     if isinstance(value, dict):
@@ -85,7 +85,7 @@ class _Source:
             if key in document:
                 said.append(f"{key}={_expression(document[key]) if key == 'variables' else repr(document[key])}")
         parameters = document.get("parameters") or {}
-        # A required parameter may stand behind one with a default.
+        # A required parameter may follow one with a default.
         shown = ", ".join(["*", *(_parameter(name, parameter) for name, parameter in parameters.items())]) if parameters else ""
         self.line(f"@ratn.task({', '.join(said)})" if said else "@ratn.task")
         self.line(f"def {function}({shown}):")
@@ -109,7 +109,7 @@ class _Source:
     def form(self, name: str | None, body: dict[str, Any]) -> None:
         called = [] if name is None else [f"name={name!r}"]
         retry = body.get("retry")
-        # A loop or a condition has what is done before another try in the words of task files.
+        # A loop or a condition keeps its `before` in the language of task files.
         if isinstance(retry, dict) and "before" in retry and ("action" in body or "states" in body):
             self.retried(called, body, retry)
         elif "action" in body:
@@ -160,7 +160,7 @@ class _Source:
         self.block("sequence", [*called, *_annotations(body, ("states",))], body.get("states"))
 
     def retried(self, called: list[str], body: dict[str, Any], retry: dict[str, Any]) -> None:
-        """With something done before each try: of an action, the block is that action."""
+        """A block with states before each retry; for a single action, the block is that action."""
         times = [repr(retry["times"])] if "times" in retry else []
         times += [f"{key}={value!r}" for key, value in retry.items() if key in ("on", "backoff")]
         rest = {key: value for key, value in body.items() if key not in ("retry", "states")}
@@ -193,12 +193,12 @@ class _Source:
 
 
 _FORMS = ("fallback", "cases", "action", "for", "condition", "states", "while", "do_while", "until", "concurrency", "library", "wait", "ask")
-#: Words that say what a state is wherever they stand in a list of states: none is called so. (`wait` and `ask` are told apart by what is below them.)
+#: Keys that give the kind of a state wherever they occur: no state has such a name. (For `wait` and `ask`, the content decides.)
 WORDS_OF_FORMS = frozenset({*_FORMS, "switch"} - {"cases", "wait", "ask"})
 
 
 def named(item: dict[str, Any]) -> tuple[str | None, dict[str, Any]]:
-    """The name of a state in a list, if it has one, and what is said of it."""
+    """The name of a state in a list, if it has one, and its definition."""
     if len(item) == 1:
         ((key, value),) = item.items()
         if isinstance(value, dict) and not _is_form(key, value):
@@ -207,7 +207,7 @@ def named(item: dict[str, Any]) -> tuple[str | None, dict[str, Any]]:
 
 
 def _is_form(key: str, value: dict[str, Any]) -> bool:
-    """Whether it is a state without a name that waits or asks: states may be called so, too."""
+    """Whether an entry is an unnamed state that waits or asks: states may have these names, too."""
     if key not in ("wait", "ask"):
         return False
     is_state = any(form in value for form in _FORMS)
@@ -215,7 +215,7 @@ def _is_form(key: str, value: dict[str, Any]) -> bool:
 
 
 def _written_out(body: dict[str, Any]) -> dict[str, Any]:
-    """`switch` as conditions in each other, `fallback` as states that lead to each other: as the loader reads them."""
+    """Expands `switch` to nested conditions, and `fallback` to states with transitions, as the loader does."""
     if "fallback" in body:
         ways = [dict(way) for way in body["fallback"]]
         names = [next(iter(way)) for way in ways]

@@ -1,4 +1,4 @@
-"""States without states inside, as functions: actions, waits, parts from other files, functions of expressions, variables."""
+"""States without inner states, as functions: actions, waits, libraries, expression functions, variables."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ratn._trace import AnyState, State, Trace, assigned_name
 def perform(
     action: str, inputs: dict[str, Any], annotations: dict[str, Any], *, name: str | None = None, kind: str | None = None
 ) -> AnyState:
-    """Adds a state that performs ``provider/action``. Where nobody says its resources, it blocks one of ``kind``, which performs it."""
+    """Adds a state that performs ``provider/action``. Unless resources are given, it blocks one of ``kind``, the kind of the provider."""
     at = user_line()
     trace = Trace.now(f"`{action}`")
     function = action.rpartition("/")[2]
@@ -60,13 +60,13 @@ class Provider:
         name = said.pop("name", None) if "name" not in ports else None
         inputs = dict(said.pop("inputs", {})) if "inputs" not in ports else {}
         for key in list(said):
-            # Where a port has the name of an annotation, the port is meant by `inputs={…}` only.
+            # If a port has the name of an annotation, the port can be given only by `inputs={…}`.
             if key not in ANNOTATIONS:
                 if key not in ports:
                     known = ", ".join(sorted(ports)) or "none"
                     raise TypeError(f"`{self._name}.{action}` has no input `{key}`; it has {known}. Annotations are {', '.join(ANNOTATIONS)}")
                 inputs[key] = said.pop(key)
-        # What the catalogue says that the action blocks is in force where the state says nothing.
+        # Resources from the catalogue apply if the state gives none.
         kind = None if signature.get("annotations", {}).get("resources") else self._provider["resource"]
         return perform(f"{self._name}/{action}", inputs, said, name=name, kind=kind)
 
@@ -141,7 +141,7 @@ def ask(
     if isinstance(question, Value) and not text.startswith(("'", '"', "$", "concat(")):
         text = f"concat({text})"
     elif not isinstance(question, Value) and text.startswith(("'", '"', "$", "concat(")):
-        # As a sentence, and not as an expression.
+        # As a text literal, and not as an expression.
         text = json.dumps(text, ensure_ascii=False)
     body: dict[str, Any] = {"question": text, "choices": list(choices)}
     if default is not None:
@@ -162,7 +162,7 @@ def _own(function: str, name: str | None, default: str, body: dict[str, Any], an
 
 
 class TaskFunction:
-    """A function of expressions, of a task: see :func:`function`."""
+    """An expression function of a task: see :func:`function`."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function, self._name = function, function.__name__

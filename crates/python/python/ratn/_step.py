@@ -20,12 +20,12 @@ from ratn._ratn import Error, Goal
 
 #: The steps of this process, by file and name.
 _STEPS: dict[str, dict[str, Step]] = {}
-#: The file that a worker is reading its steps from.
+#: The file from which a worker is reading its steps.
 _being_read: str | None = None
 
 
 def refuse_while_read(what: str) -> None:
-    """A program that would start itself again and again ends here."""
+    """Ends a program that would otherwise start itself again and again."""
     if _being_read is not None:
         raise Error(
             f"{_being_read} is being read by the worker of its steps, and {what}: write what the program does below `if __name__ == \"__main__\":`"
@@ -33,7 +33,7 @@ def refuse_while_read(what: str) -> None:
 
 
 def kind_of(provider: str) -> str:
-    """The kind of resource that a provider of steps is."""
+    """The kind of resource of a provider of steps."""
     return "".join(part.capitalize() for part in provider.split("_"))
 
 
@@ -45,7 +45,7 @@ class Step:
         self.name = name or function.__name__
         self.file = os.path.abspath(function.__code__.co_filename)
         stem = "".join(letter if letter.isalnum() else "_" for letter in pathlib.Path(self.file).stem).lower().strip("_")
-        #: What tasks call the worker, and the kind of resource that it is.
+        #: The name of the provider in tasks, and the kind of its resource.
         self.provider = f"{stem or 'steps'}_steps"
         self.kind = kind_of(self.provider)
         parameters = list(inspect.signature(function).parameters)
@@ -53,11 +53,11 @@ class Step:
         self.takes_goal = bool(parameters) and (hints.get(parameters[0]) is Goal or parameters[0] == "goal")
         of_file = _STEPS.setdefault(self.file, {})
         before = of_file.get(self.name)
-        # A file may be read twice: as the worker does it, and by a module of it that imports it.
+        # A file may be read twice: by the worker, and by an import in one of its modules.
         if _being_read == self.file and before is not None and before.function.__code__.co_firstlineno != function.__code__.co_firstlineno:
             raise ValueError(f"{_ports.where(function)}: there is a step `{self.name}` in this file already")
         of_file[self.name] = self
-        # Refused here and now, with the line of the function.
+        # A fault is refused here, with the line of the function.
         self.action = self._known_to(_worker.Worker(self.provider, kind=self.kind))
 
     def _known_to(self, worker: _worker.Worker) -> _ports.Action:
@@ -83,7 +83,7 @@ class Step:
         for key in given:
             if key not in _annotations.ANNOTATIONS:
                 raise TypeError(f"the step `{self.name}` has no input `{key}`; it has {', '.join(sorted(ports)) or 'none'}")
-        # What it says of itself holds for the state, unless the state says otherwise.
+        # The step's annotations apply to the state, unless the state gives others.
         said = {"computes": self.action.computes or None, "reads": self.action.reads or ([] if self.action.computes else None)}
         said |= {key: getattr(self.action, key) or None for key in ("senses", "requires", "effects")}
         return _states.perform(f"{provider}/{self.name}", inputs, {**said, **given}, name=name, kind=kind_of(provider))
@@ -98,7 +98,7 @@ class Step:
 
 
 def _without_goal(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same with a goal in front, as an action has it."""
+    """The function with an additional first parameter for the goal, as an action has it."""
     signature = inspect.signature(function)
     goal = inspect.Parameter("goal", inspect.Parameter.POSITIONAL_ONLY, annotation=Goal)
     if "goal" in signature.parameters:
@@ -146,7 +146,7 @@ def step(
     It is as ``Worker.action``, but for the goal, which it may do without. Its file is run by the worker: what shall happen only in the
     program that starts the run stands below ``if __name__ == "__main__":``.
     """
-    # They are read twice: here, and by the worker.
+    # The arguments may be iterators, and are needed twice: here, and by the worker.
     outcomes, reads, senses, requires, effects = (list(said) for said in (outcomes, reads, senses, requires, effects))
     computes = not (senses or effects) if computes is None else computes
     said = {"outputs": outputs, "outcomes": outcomes, "computes": computes, "reads": reads, "senses": senses, "requires": requires, "effects": effects}
@@ -154,7 +154,7 @@ def step(
 
 
 def serve(file: str, provider: str, arguments: list[str]) -> None:
-    """Serves the steps of a file, as this provider."""
+    """Serves the steps of a file under this provider name."""
     path = os.path.abspath(file)
     sys.path.insert(0, os.path.dirname(path))
     global _being_read
@@ -173,7 +173,7 @@ def serve(file: str, provider: str, arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    # The package's own module, not this one that is called `__main__`.
+    # The package's own module, not this one, whose name is `__main__`.
     from ratn import _step
 
     _step.serve(sys.argv[1], sys.argv[2], sys.argv[3:])

@@ -1,4 +1,4 @@
-"""Stubs of the actions of a catalogue: what editors complete, and what type checkers refuse."""
+"""Stubs of the actions of a catalogue, for completion in editors and for type checkers."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def stubs(catalogue: str | None, what: str) -> str:
 
 def _provider(name: str, provider: dict[str, Any]) -> str:
     states, methods = [], []
-    # What is no name of Python is performed by `ratn.action("provider/3d-scan", …)`.
+    # An action whose name is no Python name is performed by `ratn.action("provider/3d-scan", …)`.
     for action, signature in sorted(item for item in provider["actions"].items() if _is_name(item[0])):
         state = f"{_title(name)}_{_title(action)}"
         outputs = [port for port in sorted(signature.get("outputs", {})) if _is_name(port)]
@@ -74,7 +74,7 @@ def _provider(name: str, provider: dict[str, Any]) -> str:
 
 
 def _title(name: str) -> str:
-    """The name of a class, which has no underscore: one stands between that of a provider and that of its action."""
+    """The name of a class, without underscores: one underscore separates the names of provider and action."""
     return "".join(part.capitalize() for part in name.split("_"))
 
 
@@ -89,12 +89,12 @@ def _is_name(port: str) -> bool:
 
 
 def _is_port(port: str) -> bool:
-    # One with the name of an annotation, or of what a method has already, is given by `inputs={…}`.
+    # A port with the name of an annotation, or of another parameter, can be given only by `inputs={…}`.
     return _is_name(port) and port not in {*Annotations.__annotations__, "self", "annotations"}
 
 
 def catalogue_of_system(runtime_dir: str | os.PathLike[str]) -> str:
-    """What a running system offers beside the built-in catalogue, as a catalogue in TOML: what its config and its workers say."""
+    """The additions of a running system to the built-in catalogue, as TOML: from its config and its workers."""
     from ratn._system import _told
 
     told = _told(["actions", "--json", "--runtime-dir", os.fspath(runtime_dir)])
@@ -104,7 +104,7 @@ def catalogue_of_system(runtime_dir: str | os.PathLike[str]) -> str:
 
 
 def toml(actions: list[dict[str, Any]]) -> str:
-    """A catalogue with these actions: each with ``action`` (``provider/action``), ``resource``, and its signature."""
+    """A catalogue with these actions as TOML: each with ``action`` (``provider/action``), ``resource``, and its signature."""
     known = json.loads(_ratn.catalogue([]))
     kinds = sorted({action["resource"] for action in actions} - known["resources"].keys())
     lines = [line for kind in kinds for line in (f"[resources.{_key(kind)}]", 'class = "process"', "count = 64", "")]
@@ -125,10 +125,10 @@ def _key(name: str) -> str:
 
 
 def _value(value: Any) -> str:
-    """A text, a truth, a list or a table of them, as TOML has it."""
+    """A text, a boolean, a list or a table of these, as TOML."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{_key(str(key))} = {_value(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list):
         return "[" + ", ".join(map(_value, value)) + "]"
-    # A text of JSON is one of TOML, but for what that escapes in two halves, and for DEL.
+    # A JSON string is a TOML string, except for surrogate pairs and DEL.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

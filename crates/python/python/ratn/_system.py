@@ -36,10 +36,10 @@ _READY = "the system is ready"
 _READY_WITHIN_S = 60.0
 _ENDED_WITHIN_S = 20.0
 _LOOK_S = 0.02
-#: How often it is looked whether the workers of steps are there, and how many take the place of others in a run.
+#: Interval of checks whether the workers of steps exist, and the maximum number of replacements in a run.
 _LOOK_AT_WORKERS_S = 0.2
 _WORKERS_AGAIN = 3
-#: What a process manager tells the workers of its pools. A worker of steps is in none, also where the program that runs the task is.
+#: Variables that a process manager sets for its pooled workers. They are removed for workers of steps, which are never pooled.
 _OF_POOLED = ("RATN_PROVIDER_SESSION", "RATN_RESOURCE_MANAGER", "RATN_STANDSTILL_MS", "RATN_STUCK_TIMEOUT_MS", "RATN_WORKER_LISTEN")
 
 
@@ -54,23 +54,23 @@ def _program() -> str:
 
 
 def _told(words: list[str]) -> subprocess.CompletedProcess[str]:
-    """What the program says."""
+    """Runs the program, and returns its output."""
     return subprocess.run([_program(), *words], capture_output=True, text=True, encoding="utf-8", errors="replace")
 
 
 def _environment() -> dict[str, str]:
-    """Of the daemons: those workers in Python that say no interpreter are run by the one of this virtual environment, whether it is active or not."""
+    """The environment of the daemons: Python workers whose template names no interpreter use the one of this virtual environment, active or not."""
     own = {"VIRTUAL_ENV": sys.prefix} if sys.prefix != sys.base_prefix else {}
     return {**os.environ, **own}
 
 
 def _text_of(file: pathlib.Path) -> str:
-    """What a process has written, as far as that is text."""
+    """The output of a process, decoded as far as it is text."""
     return file.read_text(encoding="utf-8", errors="replace")
 
 
 def _remove(folder: str, maker: _ratn.Process, processes: list[subprocess.Popen[Any]]) -> None:
-    """Removes a folder, unless a process still writes into it. A fork of the process that made it leaves it alone."""
+    """Removes a folder, unless a process still writes into it. Does nothing in a fork of the process that made it."""
     if maker.is_here and all(process.poll() is not None for process in processes):
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -84,7 +84,7 @@ def _default_directory() -> pathlib.Path:
 
 
 def _due(due: float | str | datetime.timedelta | datetime.datetime) -> str:
-    """A due time in the words of ``ratn run``."""
+    """A due time in the form that ``ratn run`` takes."""
     if isinstance(due, datetime.datetime):
         return due.astimezone(datetime.timezone.utc).isoformat()
     if isinstance(due, datetime.timedelta):
@@ -139,7 +139,7 @@ class System:
 
     def _start(self, config: object, runtime_dir: object, options: dict[str, object]) -> None:
         folder = pathlib.Path(tempfile.mkdtemp(prefix="ratn-"))
-        # Without `close()` the system ends with this object, and writes there no more that anybody could ask for.
+        # Without `close()` the system ends with this object; its output is then no longer accessible, so it is not kept.
         self._clean = weakref.finalize(self, _remove, str(folder), self._maker, [])
         self.runtime_dir = pathlib.Path(str(runtime_dir)) if runtime_dir is not None else folder / "run"
         command = [_program(), "up", "--exit-with-parent", "--runtime-dir", str(self.runtime_dir)]
@@ -276,7 +276,7 @@ class _OfSteps:
 
 
 class _Child(subprocess.Popen[Any]):
-    """A process that is waited for by the one that started it. In a fork of that it would count as ended."""
+    """A process that is waited for by the process that started it. In a fork, a wait would report it as ended."""
 
     def __init__(self, *given: Any, **named: Any) -> None:
         self._maker = _ratn.Process()
@@ -313,7 +313,7 @@ class Run:
         self._processes: list[subprocess.Popen[Any]] = []
         self._maker = _ratn.Process()
         weakref.finalize(self, _remove, str(folder), self._maker, self._processes)
-        #: The event log, which ``ratn report`` reads.
+        #: The path of the event log, which ``ratn report`` reads.
         self.log = pathlib.Path(log) if log is not None else folder / "run.jsonl"
         self._workers: list[subprocess.Popen[bytes]] = []
         self._of_steps: list[_OfSteps] = []
@@ -321,7 +321,7 @@ class Run:
         steps: dict[str, str] = {}
         if isinstance(task, Task):
             task = task._knowing(lambda: _resources.of_system(system.runtime_dir))
-            # Steps are done by workers of this run alone: another one may have other workers of the same file.
+            # Steps are performed only by workers of this run: another run may have other workers for the same file.
             token = secrets.token_hex(4)
             providers = {provider: f"{provider}_{token}" for provider in task._step_files()}
             steps = {providers[provider]: file for provider, file in task._step_files().items()}
@@ -334,7 +334,7 @@ class Run:
         command += ["--urgency", urgency, *(["--alone"] if alone else []), f"--share={share}"]
         command += [f"--due={_due(due)}"] if due is not None else []
         for name, value in parameters.items():
-            # Texts are taken as they are.
+            # Texts are passed as literals.
             command += ["--set", f"{name}={literal(value) if isinstance(value, str) else expression(value)}"]
         self._said, self._told = folder / "result.json", folder / "messages"
         self._start_steps(steps, step_workers, folder)
@@ -346,11 +346,11 @@ class Run:
             raise
         self._processes.append(self._process)
         if self._workers:
-            # They end with the run, also where nobody asks for its result.
+            # The workers end with the run, even if its result is never asked for.
             threading.Thread(target=self._end_with_run, args=[folder], daemon=True).start()
 
     def _start_steps(self, steps: dict[str, str], each: int, folder: pathlib.Path) -> None:
-        """Workers for the steps, one or more for each provider with its file, which offer themselves to the system."""
+        """Starts the workers of steps, one or more for each provider with its file; they offer themselves to the system."""
         if not steps:
             return
         if each < 1:
@@ -373,7 +373,7 @@ class Run:
             raise
 
     def _start_worker(self, provider: str, file: str, folder: pathlib.Path, place: int | None = None) -> None:
-        """Starts a worker of steps, in the place of one that has ended where that is said."""
+        """Starts a worker of steps, possibly as the replacement of one that has ended."""
         self._begun += 1
         name = f"{provider.replace('_', '-')}-{self._begun}"
         said = folder / f"{name}.log"
@@ -393,7 +393,7 @@ class Run:
             self._workers[place], self._of_steps[place] = worker, step
 
     def _end_with_run(self, folder: pathlib.Path) -> None:
-        """Has others take the place of workers that end before the run does; without any it would wait for ever."""
+        """Replaces workers that end before the run does: without any worker the run would wait for ever."""
         left = _WORKERS_AGAIN
         try:
             while True:
@@ -416,23 +416,23 @@ class Run:
             self._end_steps()
 
     def _start_again(self, step: _OfSteps, folder: pathlib.Path, place: int) -> None:
-        """Starts a worker in the place of one that has ended; one that cannot be started is looked after again in the next round."""
+        """Replaces a worker that has ended; if that fails, the next round tries again."""
         try:
             self._start_worker(step.provider, step.file, folder, place)
         except OSError as error:
-            # The manager is being started anew, or there is no room for a process.
+            # The resource manager may be restarting, or the system cannot start a process.
             with contextlib.suppress(OSError), step.said.open("a", encoding="utf-8") as said:
                 said.write(f"\nno other worker could be started in its place: {error}\n")
 
     def _has_worker(self, file: str) -> bool:
-        """Whether a worker of the steps in a file is there still."""
+        """Whether the worker of the steps in a file still exists."""
         return any(step.file == file and worker.poll() is None for worker, step in zip(self._workers, self._of_steps))
 
     def _abort_without_steps(self) -> None:
         try:
             self.abort()
         except (Error, OSError):
-            # It is ending, or does not listen: its process is told.
+            # It is ending, or does not listen: terminate its process.
             self._process.terminate()
 
     def _end_steps(self) -> None:
@@ -474,7 +474,7 @@ class Run:
                 yield event
 
     def _pieces(self) -> Iterator[list[dict[str, Any]]]:
-        """The lines of the log as they come, several at a time; nothing where none has come yet."""
+        """The lines of the log as they arrive, several at a time; an empty piece if there are none yet."""
         rest, read = b"", 0
         while True:
             ended = not self.under_way
@@ -500,7 +500,7 @@ class Run:
         try:
             said = json.loads(_text_of(self._said))
         except ValueError:
-            # It could not begin, or was killed.
+            # The run could not begin, or was killed.
             raise Error(self.messages().strip() or f"the run has ended with code {self._process.returncode}") from None
         reason = "; ".join(part for part in (said.get("reason", ""), self._lost) if part)
         return Result(said["outcome"], said.get("outputs", {}), reason, said.get("makespan_s", 0.0))
@@ -559,7 +559,7 @@ class Run:
         return self._control("abort")
 
     def _wait_for_log(self) -> None:
-        # A run that has just begun has not written its first line.
+        # A run that has just begun may not have written its first line yet.
         until = time.monotonic() + _ENDED_WITHIN_S
         while not (self.log.exists() and b"\n" in self.log.read_bytes()[:1_000_000]):
             if not self.under_way and not self.log.exists():

@@ -63,7 +63,7 @@ class Task:
     ) -> None:
         #: The tree, as dicts and lists.
         self.document = document
-        #: What the paths of libraries and the ontology are relative to.
+        #: The folder to which the paths of libraries and the ontology are relative.
         self.folder = folder
         self._file, self._catalogues, self._steps = file, list(catalogues), dict(steps or {})
         self._source, self._is_traced = source, is_traced
@@ -82,7 +82,7 @@ class Task:
         return f"<Task {self.name} of {self._file}>"
 
     def __call__(self, *_: object, **given: object) -> NoReturn:
-        """A task is no function any more: says what runs it."""
+        """A task is not callable any more: raises an error that says how to run it."""
         shown = ", ".join([self.name, *(f"{name}=…" for name in given)])
         raise TypeError(
             f"the task `{self.name}` is traced already and is not called: run it with `system.run({shown})`; in another task "
@@ -121,7 +121,7 @@ class Task:
         return _source.python_of(self.document)
 
     def _lines(self) -> _yaml.Lines:
-        """Its text, which is that of the file as long as nobody has changed what was read."""
+        """The text of the task; it is the file's own text if the tree that was read has not been changed."""
         if self._source is not None and _ratn.read_yaml(self._source, self._file) == self.document:
             lines = _yaml.Lines()
             lines.text = self._source.splitlines()
@@ -133,11 +133,11 @@ class Task:
         return "\n".join(self._standing_alone().text) + "\n"
 
     def _step_files(self) -> dict[str, str]:
-        """The files of its steps, by the provider that they are in it."""
+        """The files of its steps, by their provider in the task."""
         return {name.rpartition("/")[0]: step.file for name, step in self._steps.items()}
 
     def _with_providers(self, providers: dict[str, str]) -> Task:
-        """The same, whose steps are done by other providers."""
+        """The same task with other providers for its steps."""
         actions = {name: f"{providers[name.rpartition('/')[0]]}/{step.name}" for name, step in self._steps.items()}
         kinds = {kind_of(provider): kind_of(own) for provider, own in providers.items()}
 
@@ -152,8 +152,8 @@ class Task:
         return Task(document, folder=self.folder, file=self._file, catalogues=self._catalogues, steps=steps)
 
     def _knowing(self, offered: Callable[[], _resources.Offers] | None = None) -> Task:
-        """The same, whose states that say no resources block what performs them; `offered` are those of a system, which is asked where that is in no catalogue. A
-        task file says all itself."""
+        """The same task, in which states without resources block the providers of their actions. `offered` returns the actions of a system; it is called
+        if an action is in no catalogue. A task from a file already has all its resources."""
         if not self._is_traced:
             return self
         known = _resources.of_catalogues(*self._all_catalogues())
@@ -170,7 +170,7 @@ class Task:
                 )
             return asked[0][action]
 
-        # A copy.
+        # Makes a copy.
         states = _changed(self.document.get("states") or [], lambda _: None)
         _resources.block_what_performs(states, offer)
         return Task({**self.document, "states": states}, folder=self.folder, file=self._file, catalogues=self._catalogues, steps=self._steps)
@@ -217,7 +217,7 @@ class Task:
         return findings
 
     def _check_with(self, system: object, config: str | os.PathLike[str] | None) -> list[Finding]:
-        """As ``ratn check`` does it, which knows what a system is."""
+        """Checks as ``ratn check`` does, with knowledge of a system."""
         from ratn._system import _told
 
         runtime_dir = getattr(system, "runtime_dir", system)
@@ -236,7 +236,7 @@ class Task:
             raise Error(told.stderr.strip() or f"`ratn check` has ended with code {told.returncode}")
         said = json.loads(told.stdout)
         findings = [self._finding(one, lines, file.name) for one in said["findings"]]
-        # Whoever performs steps comes with the run.
+        # The workers of steps come with the run.
         kinds = [f"`{kind_of(provider)}`" for provider in self._step_files()]
         workers = [what for what in said["workers"] if not any(kind in what for kind in kinds)]
         findings += [Finding("worker", "warning", self._file, 1, "", what, "") for what in workers]
@@ -256,25 +256,25 @@ class Task:
 
 
 def _changed(value: Any, change: Callable[[dict[str, Any]], None]) -> Any:
-    """States, or what is said of one, after `change` of what is said of each, also of those inside."""
+    """Applies `change` to the definition of each state, at all depths."""
     if isinstance(value, list):
         return [_changed_state(item, change) for item in value]
     if not isinstance(value, dict):
         return value
-    # What is an expression, or has some within, says neither an action nor a file.
+    # Expressions, and values that contain some, name neither actions nor files.
     body = _like(value, {key: item if key in ("in", "with", *VALUES) else _changed(item, change) for key, item in value.items()})
     change(body)
     return body
 
 
 def _changed_state(item: Any, change: Callable[[dict[str, Any]], None]) -> Any:
-    """An item of a list: its name may be a word that is said of states, too."""
+    """A changed entry of a list of states, whose name may be a word with another meaning in states."""
     name, body = _source.named(item) if isinstance(item, dict) else (None, item)
     return _changed(body, change) if name is None else _like(item, {name: _changed(body, change)})
 
 
 def _like(before: dict[str, Any], entries: dict[str, Any]) -> dict[str, Any]:
-    """A mapping in the place of another one, made in the same line."""
+    """A mapping that replaces another one and keeps its line."""
     if getattr(before, "line", None) is None:
         return entries
     body = Body(entries)
@@ -283,14 +283,14 @@ def _like(before: dict[str, Any], entries: dict[str, Any]) -> dict[str, Any]:
 
 
 def _of_kind(resource: Any, kinds: dict[str, str]) -> Any:
-    """An entry of `resources`, of the kind that is in the place of another one."""
+    """An entry of `resources` that replaces another one and keeps its kind."""
     if isinstance(resource, dict):
         return {key: kinds.get(kind, kind) if key in ("block", "consume") and isinstance(kind, str) else kind for key, kind in resource.items()}
     return kinds.get(resource, resource) if isinstance(resource, str) else resource
 
 
 def invalid(findings: list[Finding]) -> InvalidTask:
-    """The exception for findings of which one refuses the task."""
+    """The exception for findings, at least one of which refuses the task."""
     raised = InvalidTask("\n".join(map(str, findings)))
     raised.findings = findings
     return raised
@@ -339,7 +339,7 @@ def _traced(function: Callable[..., Any], name: str | None, said: dict[str, Any]
     description = said.pop("description", None) or (inspect.getdoc(function) or "").split("\n\n")[0].replace("\n", " ")
     if description:
         document["description"] = description
-    # Annotations may be texts, and name what stands beside the function within another one.
+    # Annotations may be texts, and may name variables of the enclosing function.
     hints = typing.get_type_hints(function, localns={**user_frame().f_locals}, include_extras=True)
     parameters, given = _parameters(function, hints, trace)
     refuse_identity(function)
@@ -369,7 +369,7 @@ def _traced(function: Callable[..., Any], name: str | None, said: dict[str, Any]
 
 
 def _whole(value: Any, at: tuple[str, int] | None = None) -> None:
-    """Refuses a text that is no expression and has a value in it, and a number without an end, wherever they have come to."""
+    """Refuses a text with a value in it that is no expression, and a number that is not finite, at any place."""
     if isinstance(value, dict):
         at = getattr(value, "line", None) or at
         for key, item in value.items():

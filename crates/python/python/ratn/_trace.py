@@ -1,4 +1,4 @@
-"""What is being traced: the states in the making, and the outputs of those that there are."""
+"""The state of tracing: the states in construction, and the outputs of those that exist."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if typing.TYPE_CHECKING:
     from ratn._states import TaskFunction
 
 tracing: contextvars.ContextVar[Trace | None] = contextvars.ContextVar("ratn_tracing", default=None)
-#: No state is called so: a task file means something else by them.
+#: Names that no state may have, because they have another meaning in a task file.
 _NO_NAMES = WORDS_OF_FORMS | KEYWORDS
-#: The numbers of values in texts. One of another task is none of this one.
+#: The numbers of values in texts. They are unique across tasks.
 _numbers = itertools.count()
 
 
 class Node:
-    """A state in the making: its body, and the lists of states inside."""
+    """A state in construction: its body, and its inner lists of states."""
 
     def __init__(
         self, siblings: list[Node], owner: Node | None, name: str | None, line: tuple[str, int], default: str, implied: str | None = None
@@ -36,20 +36,20 @@ class Node:
         self.branches: dict[str, list[Node]] = {}
         self.before: list[Node] | None = None
         self.is_open = False
-        #: The variables that it binds, for what is inside of it.
+        #: The variables that it binds, for the states inside it.
         self.bindings: dict[str, Binding] = {}
-        #: Variables of what is around that were named inside of it.
+        #: Variables from outside that were named inside it.
         self.spoken: dict[str, Binding] = {}
         siblings.append(self)
         beside = self._beside()
         if name is not None:
             self.name = _free(name, beside)
         else:
-            # Where nobody has said a name it hides none of what is around.
+            # A default name hides no name from outside.
             self.name = None if implied is None else _free(implied, beside | self._around() | _NO_NAMES)
 
     def _beside(self) -> set[str | None]:
-        """The names of the other states of its list, also those that states without one get where the file is read: one after the other."""
+        """The names of the other states in its list; also those that states without a name get when the file is read, one after the other."""
         names = set[str | None]()
         is_before = True
         for other in self.siblings:
@@ -62,7 +62,7 @@ class Node:
         return names
 
     def _around(self) -> set[str | None]:
-        """The names of the states beside those that it is inside of."""
+        """The names of the siblings of the states that contain it."""
         names, node = set[str | None](), self.owner
         while node is not None:
             names |= {other.name for other in node.siblings}
@@ -70,19 +70,19 @@ class Node:
         return names
 
     def _below(self) -> set[str | None]:
-        """The names of all states inside of it."""
+        """The names of all states inside it."""
         lists = [*self.branches.values(), *([self.before] if self.before else [])]
         return {name for states in lists for node in states for name in (node.name, *node._below())}
 
     def named(self) -> str:
-        """Its name; one that had none gets one, because somebody speaks of it."""
+        """Its name; a state without one gets one, because it is referred to."""
         if self.name is None:
             below = {name for other in self.siblings for name in other._below()}
             self.name = _free(self.default, below | self._beside() | self._around() | _NO_NAMES)
         return self.name
 
     def put_out(self, text: str, *names: str) -> str:
-        """The name of the output with this value, which is added where there is none."""
+        """The name of the output with this value; adds the output if there is none."""
         outputs = self.body.setdefault("outputs", {})
         known = [name for name, said in outputs.items() if said == text]
         free = [name for name in names if name not in outputs] or [f"{names[-1]}_{len(outputs)}"]
@@ -91,7 +91,7 @@ class Node:
         return str(name)
 
     def item(self) -> Body:
-        """As it stands in a list of states."""
+        """Its entry in a list of states."""
         body = Body(self.body)
         body.line = self.line
         for key, inside in self.branches.items():
@@ -106,7 +106,7 @@ class Node:
 
 
 def _free(name: str, taken: typing.Collection[str | None]) -> str:
-    """The name, with a number where it is taken."""
+    """The name, with a number appended if it is taken."""
     number, free = 2, name
     while free in taken:
         free, number = f"{name}_{number}", number + 1
@@ -114,7 +114,7 @@ def _free(name: str, taken: typing.Collection[str | None]) -> str:
 
 
 class Trace:
-    """What is being traced: the lists of states that are open, the innermost last."""
+    """The state of a trace: the open lists of states, the innermost last."""
 
     def __init__(self, file: str) -> None:
         self.file = file
@@ -123,28 +123,28 @@ class Trace:
         self.variables: dict[str, Any] = {}
         self.catalogues: list[str] = []
         self.steps: dict[str, Any] = {}
-        #: The files of steps, by the provider that each of them is here.
+        #: The files of steps, by their provider name here.
         self.step_files: dict[str, str] = {}
         self.functions: dict[str, tuple[TaskFunction, str, str]] = {}
         #: The parameters and variables of the task.
         self.bindings: dict[str, Binding] = {}
-        #: The states that were named from inside of a list and stand outside of it, by that list.
+        #: The states outside a list that were referred to from inside it, by that list.
         self._spoken: dict[int, tuple[list[Node], dict[str, Node]]] = {}
         #: Values in texts, by their numbers.
         self._in_texts: dict[int, Value] = {}
-        #: Transitions: the state that has one, that which it leads to, and the line.
+        #: Transitions: the state that has it, its target, and the line.
         self._leads: list[tuple[Node, Node, tuple[str, int]]] = []
 
     @staticmethod
     def now(what: str) -> Trace:
-        """The one that is at work."""
+        """The trace that is running."""
         trace = tracing.get()
         if trace is None:
             refuse(f"{what} belongs into a task", "call it in a function with `@ratn.task`")
         return trace
 
     def add(self, name: str | None, default: str, at: tuple[str, int] | None = None, implied: str | None = None) -> Node:
-        """A further state; `implied` is what it is called where nobody has said a name."""
+        """Adds a state; `implied` is its default name."""
         siblings, owner = self.open[-1]
         at = at or user_line()
         frame = user_frame()
@@ -166,46 +166,46 @@ class Trace:
         return Node(siblings, owner, name, at, default, implied)
 
     def _spoken_in(self, siblings: list[Node]) -> dict[str, Node]:
-        """The states that were named from inside of a list and stand outside of it."""
-        # The list stays: another one would get its address.
+        """The states outside a list that were referred to from inside it."""
+        # The list is kept alive, so that no other one gets its address.
         return self._spoken.setdefault(id(siblings), (siblings, {}))[1]
 
     def name_in_text(self, value: Value) -> int:
-        """The number of a value that stands in a text."""
+        """The number of a value that is named in a text."""
         number = next(_numbers)
         self._in_texts[number] = value
         return number
 
     def named_in_text(self, number: int) -> Value:
-        """The value with a number."""
+        """The value with this number."""
         value = self._in_texts.get(number)
         if value is None:
             refuse("a text with a value of another task in it", "make the text in the task that uses it")
         return value
 
     def leads_to(self, node: Node) -> str:
-        """What a state is called in a transition of the state that was added last."""
+        """The name of a state in a transition of the state that was added last."""
         siblings, _ = self.open[-1]
         if siblings:
             self._leads.append((siblings[-1], node, user_line()))
         return node.named()
 
     def check_leads(self) -> None:
-        """Refuses transitions that do not lead to a state beside the one that has them."""
+        """Refuses transitions that do not lead to a sibling of their state."""
         for node, target, at in self._leads:
             if node.siblings is not target.siblings:
                 what = f"a transition leads to the state `{target.named()}` of {target.line[0]}:{target.line[1]}, which is not beside the one that has it"
                 refuse(what, "lead to a state beside it, or give the block around a transition (`ratn.leave(outcome)` leads out of it)", at)
 
     def provider_of_steps(self, provider: str, file: str) -> str:
-        """What the steps of a file are called here: two files of one name are two providers."""
+        """The provider name for the steps of a file: two files of the same name are two providers."""
         number, name = 2, provider
         while self.step_files.setdefault(name, file) != file:
             number, name = number + 1, f"{provider}_{number}"
         return name
 
     def free(self, node: Node | None, name: str) -> str:
-        """The name of a variable that hides none; of one that `node` binds, unless that is still to come."""
+        """A variable name that hides no other variable; nor, if `node` exists already, a variable that was named inside `node`."""
         taken = set(self.bindings)
         for _, owner in self.open:
             if owner is not None:
@@ -217,7 +217,7 @@ class Trace:
         return node.bindings.setdefault(name, Binding(name, kind, at))
 
     def declare(self, owner: Node | None, name: str, at: tuple[str, int]) -> Binding:
-        """A scoped variable of a block, or of the task."""
+        """Declares a scoped variable of a block, or of the task."""
         known = self.bindings if owner is None else owner.bindings
         before = known.get(name) or (None if owner is None else owner.spoken.get(name))
         if before is not None or name in (self.variables if owner is None else owner.body.get("variables", {})):
@@ -226,10 +226,10 @@ class Trace:
         return known[name]
 
     def sees(self, bound: Binding) -> None:
-        """Refuses a variable that is not what its name stands for at this place."""
+        """Refuses a variable whose name stands for something else at this place."""
         passed: list[Node] = []
         for siblings, owner in reversed(self.open):
-            # What it binds is known in what it does, and in nothing that is done before or after that.
+            # A variable that it binds is known in its own states, but not in the states before a retry, nor in those of `finally`.
             if owner is None or siblings is owner.before or siblings is owner.branches.get("finally"):
                 continue
             if owner.bindings.get(bound.name) is bound:
@@ -252,7 +252,7 @@ class Trace:
 
     def enter(self, node: Node, branch: str) -> None:
         file, line = user_line()
-        # What is always done is left by them as in Python.
+        # `return`, `break` and `continue` may leave a block that always runs, as in Python.
         jump = None if branch == "states" else jump_out_of_with(file, line)
         if jump is not None:
             word, at = jump
@@ -276,7 +276,7 @@ class Trace:
         refuse("the block that begins here is left in its middle", "a `break` or `return` cannot be traced: write `with ratn.when(…)`, or a transition", at)
 
     def seen(self, node: Node, port: str) -> str:
-        """What an output of a state is called here."""
+        """The name of a state's output at this place."""
         inside = scope_of_function()
         if inside is not None:
             refuse(f"`{inside}` sees its parameters and facts only, and uses the state `{node.named()}`", "give it that as another parameter")
@@ -306,8 +306,8 @@ class Trace:
         return self.seen(owner, owner.put_out(f"{node.named()}.{port}", port, f"{node.named()}_{port}"))
 
     def first_of(self, ways: Sequence[object]) -> str:
-        """`either` of some values. Where some are inside of one block, that puts out the first of all of them, but for those that only come
-        behind the block: they stay beside it."""
+        """`either` of some values. If some of them are inside one block, the block puts out the first of them; values of states that come after
+        the block stay beside it."""
         around = [self._hides(way) for way in ways]
         hidden = {id(block): block for block in around if block is not None}
         if len(hidden) != 1:
@@ -329,18 +329,18 @@ class Trace:
             del self.open[depth:]
         (port, *_) = _ports(next(way for way, hides in zip(ways, around, strict=True) if hides is not None))
         seen = f"{block.named()}.{block.put_out(text, port.port, f'either_{port.port}')}"
-        # The block may have failed, and that been handled: then the others are looked through beside it.
+        # The block may have failed, and the failure been handled: then the other values are tried as well.
         others = [way for at, way in enumerate(ways) if at >= first and around[at] is None]
         all_ways = [*map(expression, beside), seen, *map(expression, others)]
         return f"either({', '.join(all_ways)})" if len(all_ways) > 1 else seen
 
     def _is_behind(self, way: object, block: Node) -> bool:
-        """Whether a value is of a state beside a block that comes only after it."""
+        """Whether a value belongs to a state that comes after a sibling block."""
         beside = [port.node for port in _ports(way) if port.node.siblings is block.siblings]
         return any(block.siblings.index(node) > block.siblings.index(block) for node in beside)
 
     def _hides(self, way: object) -> Node | None:
-        """The block beside what is open that a value is inside of, if it is."""
+        """The block, a sibling of what is open, that contains a value's state, if any."""
         for port in _ports(way):
             node = port.node
             while not any(siblings is node.siblings for siblings, _ in self.open) and node.owner is not None:
@@ -350,7 +350,7 @@ class Trace:
         return None
 
     def collects(self) -> int:
-        """Where among what is open the innermost loop is."""
+        """The position of the innermost loop among what is open."""
         for at, (states, owner) in reversed(list(enumerate(self.open))):
             if owner is not None and states is owner.branches.get("do"):
                 return at
@@ -358,7 +358,7 @@ class Trace:
 
 
 class Port:
-    """An output of a state, named as it is seen where it is written down."""
+    """An output of a state, written by its name at the place of use."""
 
     def __init__(self, node: Node, port: str) -> None:
         self.node, self.port = node, port
@@ -368,7 +368,7 @@ class Port:
 
 
 class Either:
-    """The first of some values that was written on the way that was taken."""
+    """The first of several values that was written on the path taken."""
 
     def __init__(self, ways: Sequence[object]) -> None:
         self.ways = ways
@@ -378,7 +378,7 @@ class Either:
 
 
 def _ports(value: object) -> list[Port]:
-    """The outputs that a value is made of."""
+    """The outputs that a value depends on."""
     if isinstance(value, Port):
         return [value]
     if isinstance(value, Either):
@@ -396,14 +396,14 @@ class State:
 
     __slots__ = ("_node",)
     _is_state = True
-    #: How it ended, as the ``decide`` of a concurrency sees it of its regions.
+    #: The state's outcome, as the ``decide`` of a concurrency sees it for its regions.
     outcome: Value
 
     def __init__(self, node: Node) -> None:
         self._node = node
 
     if not typing.TYPE_CHECKING:
-        # To type checkers a state has the outputs that stubs say.
+        # For type checkers, a state has the outputs that stubs declare.
         def __getattr__(self, name):
             if name.startswith("_"):
                 raise AttributeError(name)
@@ -420,7 +420,7 @@ class State:
 
 
 class AnyState(State):
-    """A state of which type checkers do not know the outputs."""
+    """A state whose outputs type checkers do not know."""
 
     __slots__ = ()
     if typing.TYPE_CHECKING:
@@ -429,7 +429,7 @@ class AnyState(State):
 
 
 def assigned_name(function: str, at: tuple[str, int]) -> str | None:
-    """The variable that the call at a line is assigned to, ``look = detector.segment(…)``: its state is called so, too."""
+    """The variable to which the call at a line is assigned, ``look = detector.segment(…)``: the state gets the same name."""
     for node in statements_at_work(*at):
         if isinstance(node, ast.NamedExpr) and calls(node.value, function):
             return node.target.id

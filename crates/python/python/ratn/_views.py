@@ -1,4 +1,4 @@
-"""What an event log tells of a run, as objects that show themselves in a notebook. All of it comes from the native part, which reads the log."""
+"""Views of a run from its event log, as objects that display themselves in a notebook. All content comes from the native part, which reads the log."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class Chart:
     """A chart, which a notebook shows."""
 
     def __init__(self, svg: str) -> None:
-        #: The picture.
+        #: The picture, as SVG.
         self.svg = svg
 
     def _repr_svg_(self) -> str:
@@ -110,7 +110,7 @@ class Network:
     """The dataflow network of a run, as a graph for Mermaid, which a notebook shows."""
 
     def __init__(self, mermaid: str) -> None:
-        #: The graph.
+        #: The graph, in Mermaid's language.
         self.mermaid = mermaid
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""A worker: a process that performs actions, which are functions."""
+"""A worker: a process that performs actions, which are Python functions."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class Worker:
             if action.name in self._actions:
                 raise ValueError(f"{_ports.where(function)}: there is an action `{action.name}` already")
             if inspect.iscoroutinefunction(function):
-                # Here, and not with the first goal: reading it takes a while.
+                # Imported here, and not with the first goal, because it takes a while.
                 import asyncio  # noqa: F401
             action.perform = lambda goal, given: _performed(function, action, goal, given)
             self._actions[action.name] = action
@@ -142,7 +142,7 @@ class Worker:
 
 @dataclass
 class Driven:
-    """What a driver says beside its actions, as the native part takes it."""
+    """The settings of a driver in the form that the native part takes."""
 
     brakes: Callable[[str, str], object]
     stop_file: pathlib.Path | None
@@ -204,14 +204,14 @@ class Driver(Worker):
 
 
 def _at_a_socket(arguments: list[str]) -> list[str]:
-    """With a Unix socket as the address, unless they say one: there the system knows who lets the driver move again."""
+    """Adds a Unix socket as the address, unless the arguments give one: over it the system knows the user who releases the driver."""
     words = [word for argument in arguments for word in argument.split("=", 1)]
     given = {name: value for name, value in zip(words, words[1:]) if name.startswith("--")}
     manager, file = given.get("--resource-manager", ""), given.get("--endpoint-file", "")
     socket = f"{file.removesuffix('.endpoint')}.sock" if file else ""
     if not file and manager.startswith("unix:") and "--id" in given:
         socket = str(pathlib.Path(manager.removeprefix("unix:")).parent / f"{given['--id']}.sock")
-    # A longer path is that of no socket.
+    # A longer path is not possible for a socket.
     is_one = bool(socket) and len(socket.encode()) < 108
     return [*arguments, "--listen", f"unix:{socket}"] if is_one and "--listen" not in words else arguments
 
@@ -228,9 +228,9 @@ def _performed(
         import numpy
 
         if given[port] is not None:
-            # Without a copy where it is a block of numbers already.
+            # Without a copy, if it is contiguous memory already.
             given[port] = numpy.asarray(given[port], dtype=None if isinstance(given[port], Numbers) else float)
-    # What a goal sets there is its own: its thread performs others after it.
+    # The goal gets a context of its own, because its thread performs other goals after it.
     context, process = contextvars.copy_context(), os.getpid()
     try:
         ended = context.run(function, goal, **given)
@@ -256,7 +256,7 @@ def _performed(
 
 
 def _leave_fork(raised: BaseException | None) -> NoReturn:
-    """Ends a process that an action has forked and that has come back here: the goal is that of the process before it."""
+    """Ends a process that an action has forked and that has returned here: the goal belongs to the parent process."""
     code = 0 if raised is None else 1
     try:
         if isinstance(raised, SystemExit):
@@ -266,12 +266,12 @@ def _leave_fork(raised: BaseException | None) -> NoReturn:
         sys.stdout.flush()
         sys.stderr.flush()
     finally:
-        # Whatever cannot be said any more: nothing else of this process goes on.
+        # Whatever could not be flushed: nothing else of this process may go on.
         os._exit(code & 0xFF)
 
 
 def _meant(raised: BaseException) -> BaseException:
-    """What tasks of asyncio that belong together (`asyncio.TaskGroup`) have raised of what ends a goal as its action wants; else what was raised."""
+    """The exception that ends the goal, from the exception group of an `asyncio.TaskGroup` if the group has no other ones; else what was raised."""
     group = getattr(builtins, "BaseExceptionGroup", ())
     each, waiting = [], [raised]
     while waiting:
@@ -286,7 +286,7 @@ def _meant(raised: BaseException) -> BaseException:
 
 
 async def _until_cancelled(goal: Goal, work: Any) -> Any:
-    """Awaits the work of an ``async def``, which is cancelled as asyncio does it when the goal shall stop."""
+    """Awaits an ``async def``, which is cancelled in the way of asyncio when the goal is told to stop."""
     import asyncio
 
     task = asyncio.ensure_future(work)

@@ -1,4 +1,4 @@
-"""Writes the tree of a task file as YAML, and knows which line of it came from which line of a Python file."""
+"""Writes the tree of a task file as YAML, and maps its lines to lines of a Python file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _WIDTH = 110
 
 
 class Body(dict[str, Any]):
-    """The mapping of a state, with the line of Python that made it."""
+    """The mapping of a state, with the Python line that made it."""
 
     line: tuple[str, int] | None = None
 
@@ -22,11 +22,11 @@ class Lines:
 
     def __init__(self) -> None:
         self.text: list[str] = []
-        #: Number of a line of the text, from 1, and where in Python what begins there was made.
+        #: Line numbers of the text, from 1, and the Python line that made what begins there.
         self.origins: list[tuple[int, tuple[str, int]]] = []
 
     def origin(self, line: int) -> tuple[str, int] | None:
-        """Where in Python the innermost state was made that a line belongs to."""
+        """The Python line that made the innermost state which contains a line."""
         found = None
         for begins, place in self.origins:
             if begins <= line:
@@ -35,7 +35,7 @@ class Lines:
 
 
 def scalar(value: Any) -> str:
-    """A number, a boolean, a text or nothing."""
+    """Writes a number, a boolean, a text or null."""
     if value is None:
         return "null"
     if isinstance(value, bool):
@@ -70,14 +70,14 @@ def _is_flat(value: Any) -> bool:
 
 
 def write(document: dict[str, Any]) -> Lines:
-    """A task file."""
+    """Writes a task file."""
     lines = Lines()
     _map(lines, document, "", "")
     return lines
 
 
 def _map(lines: Lines, mapping: dict[str, Any], first: str, indent: str) -> None:
-    """The entries, of which the first one stands behind what is there already."""
+    """Writes the entries; the first one follows what is on the line already."""
     if isinstance(mapping, Body) and mapping.line is not None:
         lines.origins.append((len(lines.text) + 1, mapping.line))
     for index, (key, value) in enumerate(mapping.items()):

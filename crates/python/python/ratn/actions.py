@@ -21,7 +21,7 @@ def _catalogue(catalogue: str | None) -> dict[str, Any]:
 
 
 def module(catalogue: str | None) -> tuple[Callable[[str], Provider], Callable[[], list[str]]]:
-    """``__getattr__`` and ``__dir__`` of a module with the providers of a catalogue (TOML), which extends the built-in one."""
+    """Returns ``__getattr__`` and ``__dir__`` for a module with the providers of a catalogue (TOML), which extends the built-in one."""
 
     def attribute(name: str) -> Provider:
         providers = _catalogue(catalogue)["providers"]

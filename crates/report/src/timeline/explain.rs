@@ -1,15 +1,15 @@
-//! Why an instance waits, in one sentence, as it is now.
+//! Explains in one sentence why an instance waits at present.
 
 use super::Timeline;
 use super::instance::{Instance, Stage};
 use super::resources::{Asked, Holding};
 use ratn_model::id::InstanceId;
 
-/// More names of one kind are counted, not said.
+/// Maximum number of names listed; further ones are counted.
 const MOST_NAMES: usize = 4;
 
 impl Timeline {
-    /// Why an instance that is kept does not run, and since when. `None` where it runs or has an outcome that is real.
+    /// Why an instance that is still kept does not run, and since when. `None` if it runs, or has retired or been squashed.
     pub fn explain(&self, id: InstanceId) -> Option<String> {
         let instance = self.instance(id)?;
         let why = match instance.stage {
@@ -31,7 +31,7 @@ impl Timeline {
         Some(format!("{} waits for {why}", instance.path))
     }
 
-    /// What is before it in the program: what runs, else the first without an outcome.
+    /// What comes before it in the program: the running instances, else the first one without an outcome.
     fn older(&self, id: InstanceId) -> Option<String> {
         let running = self.at_work.range(..id).filter_map(|other| self.instance(*other));
         let names: Vec<String> =
@@ -79,13 +79,13 @@ impl Timeline {
         Some(format!("{kind}: {what}, by {}", listed(&by)))
     }
 
-    /// `4 s`, and `0.4 s` where it is short.
+    /// A duration since `from_s`: `4 s`, or `0.4 s` if it is short.
     fn since(&self, from_s: f64) -> String {
         seconds((self.end_s - from_s).max(0.0))
     }
 }
 
-/// A length of time for people.
+/// A duration for people.
 pub(crate) fn seconds(length_s: f64) -> String {
     if length_s < 9.95 && (length_s - length_s.round()).abs() >= 0.05 {
         format!("{length_s:.1} s")

@@ -1,4 +1,4 @@
-//! What each line of a log does to a [`Timeline`].
+//! Applies the lines of a log to a [`Timeline`].
 
 use super::instance::{Activity, Cause, Ending, Instance, Job, Stage};
 use super::{Changed, Commit, Span, Timeline};
@@ -10,17 +10,17 @@ use ratn_model::resource::LeasedResource;
 use ratn_model::value::Value;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-/// Kinds whose holder looks at the environment, where a log does not say who does.
+/// Kinds whose holder detects, for logs that do not say which actions sense.
 const LOOKING: [&str; 2] = ["Camera", "Detector"];
 
-/// What the log says of the task's actions at its start, by plain paths.
+/// What the log says at its start about the task's actions, by paths without visits.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Hints {
     /// PIAs whose exceptions are imprecise.
     imprecise: BTreeSet<String>,
     computes: BTreeSet<String>,
     senses: BTreeSet<String>,
-    /// Kinds that move the robot; none where the log does not say.
+    /// Kinds that move the robot; empty if the log does not say.
     actuating: BTreeSet<String>,
 }
 
@@ -35,14 +35,14 @@ impl Hints {
         }
     }
 
-    /// Whether the log says of an action that it neither only computes nor only looks.
+    /// Whether the action is a PIA according to the log: it neither only computes nor only senses.
     pub(super) fn is_pia(&self, path: &str) -> bool {
         let is_said = !(self.computes.is_empty() && self.senses.is_empty() && self.actuating.is_empty());
         let state = without_visits(path);
         is_said && !self.computes.contains(&state) && !self.senses.contains(&state)
     }
 
-    /// What a goal is: as the task says, else by what it holds.
+    /// The activity of a goal: as the task declares it, else by the resources in its lease.
     fn activity(&self, path: &str, goal: &Goal) -> Activity {
         let state = without_visits(path);
         let holds = |is_meant: &dyn Fn(&LeasedResource) -> bool| {
@@ -85,7 +85,7 @@ impl Left {
 }
 
 impl Timeline {
-    /// Takes the next line, and says what it has changed.
+    /// Applies the next line; returns what it has changed.
     pub fn apply(&mut self, line: &LogLine) -> Changed {
         let at = line.at.seconds();
         if matches!(line.entry, LogEntry::Event(Event::Resumed { .. })) {
@@ -103,7 +103,7 @@ impl Timeline {
         changed
     }
 
-    /// The log, or what is looked at of it, ends here: what is under way is so until now.
+    /// Ends the timeline here, at the end of the log or of the part that is looked at: what is under way lasts until now.
     pub fn close(&mut self) -> Changed {
         self.goes_on(self.end_s);
         for id in &self.at_work {
@@ -135,9 +135,9 @@ impl Timeline {
     fn event(&mut self, at: f64, event: &Event, changed: &mut Changed) {
         let of = instance_of(event);
         changed.instance = of;
-        // Of one that has left, its goal may still give better results: that is no news of it.
+        // An instance that has left may still get better results: that is not news about it.
         if let Some(id) = of.filter(|id| !self.is_only_improved(*id, event)) {
-            // It may be the first that is said of it.
+            // This may be the first line about the instance.
             self.known(id, at);
         }
         let path = |run: &Timeline, id: InstanceId| {
@@ -165,7 +165,7 @@ impl Timeline {
             | Event::Answered { .. }
             | Event::AbortRequested { .. } => Cause::Operator,
             Event::Signalled { signal, .. } => Cause::Signal(signal.as_str().into()),
-            // It changes nothing.
+            // These events change nothing.
             Event::Progressed { .. } | Event::Recorded { .. } | Event::SessionLost { .. } => return,
         };
         match event {
@@ -305,7 +305,7 @@ impl Timeline {
                 instance.path = path.as_str().into();
                 instance.speculative = *speculative;
             }
-            // A loop decides and is no instance of its own.
+            // A loop decides, but is no instance of its own.
             Note::Decided { decision, .. } => {
                 if let Some(instance) = self.instances.get_mut(&id) {
                     instance.decision = Some(decision.clone());
@@ -326,7 +326,7 @@ impl Timeline {
                 (instance.finished, instance.outcome) = (true, Some(outcome.clone()));
                 self.enter(id, Stage::Finished, at);
                 self.open.remove(&id);
-                // Whatever ended a wait: what goes on now has waited for that.
+                // Whatever ended the wait: what goes on now has waited for it.
                 if has_awaited {
                     self.cause = Cause::Result(id, self.known(id, at).path.clone());
                 }
@@ -378,7 +378,7 @@ impl Timeline {
         self.at_work.insert(id);
     }
 
-    /// A PIA begins: which older ones of imprecise exceptions are still at it.
+    /// Records which older PIAs with imprecise exceptions still run when a PIA begins.
     fn begins_beside(&mut self, id: InstanceId, path: &str) {
         if self.hints.imprecise.is_empty() {
             return;
@@ -392,7 +392,7 @@ impl Timeline {
     fn end(&mut self, id: InstanceId, attempt: u32, at: f64, ending: Ending, outputs: &BTreeMap<String, Value>) {
         let crashed = !matches!(ending, Ending::Outcome(..));
         let with_result = matches!(ending, Ending::Outcome(..));
-        // Whoever follows a run has no use for its trajectories.
+        // A live view does not need trajectories.
         let keeps_outputs = self.left.keep == usize::MAX;
         let instance = self.known(id, at);
         let open = |job: &Job| job.ending == Ending::Open && job.attempt == attempt;
@@ -411,13 +411,13 @@ impl Timeline {
                 self.results.insert(path, (id, index));
             }
         }
-        // Of one that has an answer the executive says whether that is its result.
+        // For an attempt with an answer, the executive decides whether the answer is its result.
         if crashed {
             self.enter(id, Stage::Waiting, at);
         }
     }
 
-    /// The result is that of an equal visit: of the same path, with a result. Of several, the one that ended last.
+    /// The instance reuses the result of an equal visit: one of the same path, with a result. Of several, the one that ended last.
     fn reuses(&mut self, id: InstanceId, at: f64) {
         let instance = self.known(id, at);
         instance.reused = true;
@@ -449,7 +449,7 @@ impl Timeline {
         self.known(id, at).enter(stage, at, &cause);
     }
 
-    /// Whether an event says no more of an instance than how its goal goes on that has given its result.
+    /// Whether an event only reports that the goal of an instance goes on after it has given a result.
     fn is_only_improved(&self, id: InstanceId, event: &Event) -> bool {
         match event {
             Event::Improved { attempt, .. } | Event::Finished { attempt, .. } | Event::Crashed { attempt, .. } => {
@@ -459,7 +459,7 @@ impl Timeline {
         }
     }
 
-    /// An instance, which may be new.
+    /// The instance of this id, which may be new.
     fn known(&mut self, id: InstanceId, at_s: f64) -> &mut Instance {
         self.instances.entry(id).or_insert_with(|| {
             self.count.expanded += 1;

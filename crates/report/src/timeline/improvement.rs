@@ -1,23 +1,23 @@
-//! What results gained that got better after they were given, while the run went on with them.
+//! The gain from results that improved after they were first given, while the run went on with them.
 
 use ratn_model::id::InstanceId;
 use serde::Serialize;
 use std::collections::BTreeMap;
 
-/// What improvement gained in a run. All of it was free: nobody waited for it.
+/// The gain from improvement in a run. All of it was free: nobody waited for it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Improvement {
-    /// Results that became real and had been given for others to go on with while their goals went on.
+    /// Number of retired results that had been given for use while their goals went on.
     pub results: usize,
-    /// How many of them got better.
+    /// Number of those that improved.
     pub better: usize,
-    /// What the first ones would have cost, in seconds of the robot's time: how long motions would have taken.
+    /// Cost of the first results, in seconds of robot time: how long the motions would have taken.
     pub first_cost_s: f64,
-    /// By how much less they cost in the end.
+    /// Reduction of that cost in the end.
     pub gained_s: f64,
 }
 
-/// The goals that gave a result and went on, until both that is over and it is known what became of the result.
+/// Goals that gave a result and went on; kept until the goal has ended and the fate of its result is known.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Improvements {
     open: BTreeMap<InstanceId, One>,
@@ -34,7 +34,7 @@ struct One {
 }
 
 impl Improvements {
-    /// A goal gave a result, its first or a better one.
+    /// A goal gave a result: its first or a better one.
     pub(super) fn given(&mut self, id: InstanceId, attempt: u32, cost_s: f64) {
         let first = One { attempt, first_s: cost_s, best_s: cost_s, is_over: false, is_real: false };
         let one = self.open.entry(id).or_insert(first);
@@ -50,7 +50,7 @@ impl Improvements {
         self.open.get(&id).is_some_and(|one| one.attempt == attempt)
     }
 
-    /// A goal does not go on. Whether it had given a result before.
+    /// A goal has ended. Returns whether it had given a result before.
     pub(super) fn is_over(&mut self, id: InstanceId, attempt: u32) -> bool {
         let Some(one) = self.open.get_mut(&id).filter(|one| one.attempt == attempt) else { return false };
         one.is_over = true;
@@ -58,7 +58,7 @@ impl Improvements {
         true
     }
 
-    /// The result is real.
+    /// The result has retired.
     pub(super) fn is_real(&mut self, id: InstanceId) {
         if let Some(one) = self.open.get_mut(&id) {
             one.is_real = true;
@@ -66,7 +66,7 @@ impl Improvements {
         }
     }
 
-    /// The result is none any more.
+    /// The result was discarded.
     pub(super) fn is_gone(&mut self, id: InstanceId) {
         self.open.remove(&id);
     }
@@ -78,7 +78,7 @@ impl Improvements {
         }
     }
 
-    /// Of what is real so far.
+    /// The gain from the results that have retired so far.
     pub(super) fn total(&self) -> Improvement {
         let mut total = self.total;
         self.open.values().filter(|one| one.is_real).for_each(|one| total.add(one));
@@ -107,7 +107,7 @@ mod tests {
             improvements.given(id, 1, cost_s);
         }
         assert!(improvements.is_over(used, 1));
-        // It crossed with the word that it is not wanted any more.
+        // The better result crossed with the message that it is not wanted any more.
         improvements.given(used, 1, 1.0);
         improvements.is_gone(discarded);
         assert_eq!(improvements.total(), Improvement::default());

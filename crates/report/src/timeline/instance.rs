@@ -1,4 +1,4 @@
-//! One visit of a state: the stages it went through, what ended each, what it waited for and what was done for it.
+//! One visit of a state: its stages, what ended each, what it waited for, and the jobs done for it.
 //!
 //! ```text
 //! waiting ──► asking ──► preparing ──► running ──► finished ──► retired
@@ -14,28 +14,28 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Where an instance is in its life.
+/// The stage of an instance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Stage {
-    /// It is in the window and has not asked for resources.
+    /// It is in the window and has not requested resources.
     Waiting,
-    /// It has asked the resource manager.
+    /// It has requested resources from the resource manager.
     Asking,
-    /// It has its resources; its goal has not been given, as a projection is being made.
+    /// It has its resources; its goal has not been given yet, because a projection is being made.
     Preparing,
-    /// A provider is at it.
+    /// A provider performs its goal.
     Running,
-    /// Its result is known and not real yet.
+    /// It has a result, which has not retired.
     Finished,
-    /// Its result is real.
+    /// Its result has retired.
     Retired,
     /// It was discarded.
     Squashed,
 }
 
 impl Stage {
-    /// As a word.
+    /// The stage's name.
     pub fn name(self) -> &'static str {
         match self {
             Stage::Waiting => "waiting",
@@ -49,35 +49,35 @@ impl Stage {
     }
 }
 
-/// What made a stage end: the event of the log on which the next one was commanded.
+/// What ended a stage: the event in the log whose commands began the next one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Cause {
     /// The run began.
     Start,
-    /// An instance, named by its path, ended or its attempt did.
+    /// An instance (with its path) ended, or an attempt of it.
     Result(InstanceId, Arc<str>),
     /// The resource manager answered this instance.
     Answer(InstanceId, Arc<str>),
     /// The world pool made the projection of this instance.
     Projected(InstanceId, Arc<str>),
-    /// Somebody else changed the world.
+    /// The world was changed from outside.
     World,
-    /// A moment had come: the next try, a timeout.
+    /// A time was reached: the next attempt, or a timeout.
     Time,
-    /// The operator said so.
+    /// A command of the operator.
     Operator,
     /// A client sent this signal.
     Signal(Arc<str>),
-    /// A look ahead found a better order.
+    /// The look-ahead found a better order.
     Advice,
-    /// Another run needed what an instance held.
+    /// Another run needed resources that an instance held.
     AnotherRun,
-    /// Task control came back.
+    /// Task control resumed the run.
     Resumed,
 }
 
 impl Cause {
-    /// The instance whose answer it was.
+    /// The instance that the cause names, if any.
     pub fn instance(&self) -> Option<InstanceId> {
         match self {
             Cause::Result(id, _) | Cause::Answer(id, _) | Cause::Projected(id, _) => Some(*id),
@@ -92,7 +92,7 @@ impl Cause {
         }
     }
 
-    /// What was waited for, as it stands behind "waits for".
+    /// The cause as the object of the phrase "waits for".
     pub fn awaited(&self) -> String {
         match self {
             Cause::Start => "the start".to_owned(),
@@ -113,7 +113,7 @@ impl Cause {
 /// A stage that is over.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Phase {
-    /// Which.
+    /// The stage.
     pub stage: Stage,
     /// When it began.
     pub from_s: f64,
@@ -128,45 +128,45 @@ pub struct Phase {
 pub struct Instance {
     /// Its number in the log.
     pub id: InstanceId,
-    /// With visit numbers, `place_all[2]/plan_transfer`.
+    /// Its path with visit numbers, `place_all[2]/plan_transfer`.
     pub path: Arc<str>,
     /// A condition on its path was undecided when it was expanded.
     pub speculative: bool,
     /// When it was expanded.
     pub expanded_s: f64,
-    /// What it was expanded on.
+    /// The cause of its expansion.
     pub expanded_by: Cause,
-    /// The stages it has left, the oldest first.
+    /// Its earlier stages, the oldest first.
     pub phases: Vec<Phase>,
-    /// Where it is.
+    /// Its present stage.
     pub stage: Stage,
-    /// Since when.
+    /// When the present stage began.
     pub since_s: f64,
-    /// What it decided, where it decides.
+    /// Its decision, if it decides.
     pub decision: Option<String>,
-    /// Who wrote what its projection shows, by path.
+    /// Paths of the instances whose effects its projection shows.
     pub writers: Vec<Arc<str>>,
-    /// When it waited for resources.
+    /// Its waits for resources.
     pub waits: Vec<Wait>,
-    /// What was done for it, by attempts.
+    /// The jobs done for it, by attempts.
     pub jobs: Vec<Job>,
-    /// How many of them have not ended.
+    /// Number of jobs that have not ended.
     pub(super) open_jobs: usize,
     /// Whether it has an outcome.
     pub finished: bool,
     /// Its outcome.
     pub outcome: Option<Arc<str>>,
-    /// Whether it has become real.
+    /// Whether it has retired.
     pub retired: bool,
     /// Whether it was discarded.
     pub squashed: bool,
-    /// What it waits for by itself: a condition, a time, a signal, an answer.
+    /// What a waiting state waits for: a condition, a time, a signal, an answer.
     pub awaits: Option<String>,
-    /// Since when it has waited so, or had until its end, and for what.
+    /// Since when a waiting state has waited, or had waited until its end, and for what.
     pub awaited_itself: Option<(f64, String)>,
-    /// Its result was taken from an equal one.
+    /// Whether its result was reused from an equal instance.
     pub reused: bool,
-    /// Why its result, or what it was at, did not count; once for each time.
+    /// Why its result, or its job, was invalidated; one entry per time.
     pub invalidations: Vec<String>,
 }
 
@@ -197,7 +197,7 @@ impl Instance {
         }
     }
 
-    /// Goes into a stage. What began and ended at once is no stage it was in, except that it waited: what ended that is its cause.
+    /// Enters a stage. A stage of no duration is not recorded, except waiting: what ended the wait is the cause.
     pub(super) fn enter(&mut self, stage: Stage, at_s: f64, cause: &Cause) {
         if self.stage == stage {
             return;
@@ -209,7 +209,7 @@ impl Instance {
         (self.stage, self.since_s) = (stage, at_s);
     }
 
-    /// What it waits for by itself is not there yet. It had waited for its turn before.
+    /// A waiting state begins to wait for its own condition. Before that it had waited for its turn.
     pub(super) fn begins_to_await(&mut self, at_s: f64, awaited: String, cause: &Cause) {
         if self.stage == Stage::Waiting && self.awaits.is_none() {
             let now_s = at_s.max(self.since_s);
@@ -220,12 +220,12 @@ impl Instance {
         self.awaits = Some(awaited);
     }
 
-    /// Nothing of it is still to come, except that an equal one takes its result.
+    /// Whether nothing more will happen to it, except that an equal instance may reuse its result.
     pub fn has_left(&self) -> bool {
         self.retired || self.squashed
     }
 
-    /// The times for which it waited before it went on; the last one of an instance that was discarded instead is not among them.
+    /// The waits after which it went on; the last wait of an instance that was discarded instead is not included.
     pub fn awaited(&self) -> impl DoubleEndedIterator<Item = &Phase> {
         let goes_on = |index: usize| {
             let next = self.phases.get(index + 1).map_or(self.stage, |phase| phase.stage);
@@ -236,7 +236,7 @@ impl Instance {
         waits.map(|(_, phase)| phase)
     }
 
-    /// What came of a job.
+    /// Whether a job was of use.
     pub fn yield_of(&self, job: &Job) -> Yield {
         let failed = job.invalidated.is_some() || matches!(job.ending, Ending::Crashed(_) | Ending::Cancelled);
         match (job.used_elsewhere, failed || self.squashed) {
@@ -252,57 +252,57 @@ impl Instance {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Yield {
-    /// Its result is real.
+    /// Its result was used.
     Used,
     /// Its result was discarded.
     Lost,
-    /// That is not known yet.
+    /// Not known yet.
     Open,
 }
 
-/// From asking for resources to their grant.
+/// A wait for resources, from the request to the grant.
 #[derive(Debug, Clone)]
 pub struct Wait {
-    /// When it asked.
+    /// Time of the request.
     pub from_s: f64,
-    /// When it had them, or asked no more.
+    /// Time of the grant, or of the withdrawal.
     pub to_s: f64,
-    /// The kinds that it asked for, room for projections left out.
+    /// The kinds requested, without room for projections.
     pub kinds: Vec<String>,
-    /// What was granted in the end.
+    /// The resources that were granted.
     pub resources: Vec<String>,
-    /// Who of this run held something of these kinds meanwhile, the one that held longest first.
+    /// Instances of this run that held resources of these kinds meanwhile, the longest holding first.
     pub behind: Vec<Behind>,
 }
 
-/// Somebody who held what another waited for.
+/// A holder of what another instance waited for.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Behind {
-    /// Who.
+    /// The holder.
     #[serde(skip)]
     pub instance: InstanceId,
-    /// By path.
+    /// The holder's path.
     pub holder: Arc<str>,
-    /// What was held.
+    /// The resource.
     pub resource: Arc<str>,
-    /// Since when, also before the wait began.
+    /// Start of the holding, also if it is before the wait.
     pub from_s: f64,
-    /// Until when; the end of the wait where it still was.
+    /// End of the holding; the end of the wait if it was still held then.
     pub to_s: f64,
-    /// It was given back during the wait.
+    /// Whether it was released during the wait.
     pub released: bool,
 }
 
-/// From giving a provider a goal to its end.
+/// A job, from giving a goal to a provider to the goal's end.
 #[derive(Debug, Clone)]
 pub struct Job {
-    /// Whoever did it.
+    /// The provider.
     pub provider: String,
-    /// What the provider was asked to do.
+    /// The action.
     pub action: String,
-    /// What it is.
+    /// Its activity.
     pub activity: Activity,
-    /// From 1.
+    /// The attempt, from 1.
     pub attempt: u32,
     /// When it began.
     pub from_s: f64,
@@ -310,15 +310,15 @@ pub struct Job {
     pub to_s: f64,
     /// How it ended.
     pub ending: Ending,
-    /// Ids of the resources that it held, room for projections left out; first the performing one.
+    /// Ids of the resources that it held, without room for projections; the performing one first.
     pub resources: Vec<String>,
-    /// What came of it.
+    /// Its outputs.
     pub outputs: BTreeMap<String, Value>,
-    /// Some instance that was expanded earlier had not finished when this began.
+    /// Whether an earlier expanded instance had not finished when this job began.
     pub ahead_of_time: bool,
-    /// Why it had to be done again, where it had to.
+    /// Why the job had to be repeated, if it had to.
     pub invalidated: Option<String>,
-    /// Another visit took its result, or a later try of the same.
+    /// Whether another visit, or a later attempt, used its result.
     pub used_elsewhere: bool,
 }
 
@@ -341,18 +341,18 @@ impl Job {
         }
     }
 
-    /// How long it took; of one that has not ended, so far.
+    /// Its duration; for a job that has not ended, its duration so far.
     pub fn length_s(&self) -> f64 {
         self.to_s - self.from_s
     }
 
-    /// It computed or looked before an instance that was expanded earlier had finished.
+    /// Whether it computed or detected before an earlier expanded instance had finished.
     pub fn is_speculation(&self) -> bool {
         self.ahead_of_time && matches!(self.activity, Activity::Detection | Activity::Planning)
     }
 }
 
-/// What a job is, as far as a log tells.
+/// The activity of a job, as far as a log tells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Activity {
@@ -360,7 +360,7 @@ pub enum Activity {
     Motion,
     /// It looks at the environment.
     Detection,
-    /// It may change the environment, and holds nothing that moves the robot.
+    /// It may change the environment, but holds nothing that moves the robot.
     Other,
     /// It works on a projection.
     Planning,
@@ -373,8 +373,8 @@ pub enum Ending {
     Outcome(String, String),
     /// Without an answer.
     Crashed(String),
-    /// It was told to stop.
+    /// Cancelled: it was told to stop.
     Cancelled,
-    /// The log ends before it.
+    /// The log ends before the job does.
     Open,
 }

@@ -1,11 +1,11 @@
-//! An event log folded into what each instance did when and why: the common ground of statistics, charts, exports and live views.
+//! Folds an event log into what each instance did when and why: the common basis of statistics, charts, exports and live views.
 //!
-//! It takes one line after the other and says what each has changed, so that a run can be followed while it goes on, looked at as it was
-//! at a moment ([`Timeline::at`]), or read as a whole ([`Timeline::of`]). Everything is in the robot's seconds since the start of the run.
-//! Only what the log says is used, so a log can be read without the task file and the system that made it.
+//! It takes one line after the other and returns what each has changed, so that a run can be followed live, viewed at a moment
+//! ([`Timeline::at`]), or read as a whole ([`Timeline::of`]). All times are in seconds of robot time since the start of the run. Only the
+//! log is used, so it can be read without the task file and the system that made it.
 //!
-//! [`Timeline::new`] keeps every instance. [`Timeline::following`] gives those away that have left the window, so that what is kept
-//! does not grow with the run.
+//! [`Timeline::new`] keeps every instance. [`Timeline::following`] drops instances that have left the window, so that memory does not grow
+//! with the run.
 
 pub(crate) mod explain;
 mod fold;
@@ -24,122 +24,122 @@ use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
-/// A run, as its log tells it so far.
+/// The timeline of a run, from its log so far.
 #[derive(Debug, Clone)]
 pub struct Timeline {
     /// The task.
     pub task: String,
-    /// Its id; empty where nobody can resume it.
+    /// The run's id; empty if it cannot be resumed.
     pub run: String,
     /// The task file.
     pub file: String,
-    /// The robot: the name of a built-in one, or the path of its description; empty where the log does not say.
+    /// The robot: the name of a built-in one, or the path of its description; empty if the log does not say.
     pub robot: String,
-    /// When it began, in milliseconds since 1970; 0 where that is not said.
+    /// Start of the run, in milliseconds since 1970; 0 if unknown.
     pub began_unix_ms: u64,
-    /// How it was executed.
+    /// The execution mode.
     pub mode: Mode,
-    /// What its random choices were derived from.
+    /// The seed of its random choices.
     pub seed: u64,
     /// Its parameters.
     pub parameters: BTreeMap<String, Value>,
-    /// `None` when the log ends before the run does.
+    /// `None` if the log ends before the run does.
     pub outcome: Option<String>,
-    /// Why it ended so; empty for a success.
+    /// The reason of the outcome; empty for success.
     pub reason: String,
     /// What ended it.
     pub ended_by: Cause,
-    /// What the task gave.
+    /// The task's outputs.
     pub outputs: BTreeMap<String, Value>,
-    /// When the run (or the log) ends.
+    /// End of the run, or of the log.
     pub end_s: f64,
-    /// From each request for a pause to its end.
+    /// The pauses, each from its request to its end.
     pub pauses: Vec<Span>,
-    /// How many single steps were asked for.
+    /// Number of single steps requested.
     pub steps: usize,
-    /// Before which states the run pauses, by their paths without visits.
+    /// The states before which the run pauses, by their paths without visits.
     pub breakpoints: Vec<String>,
-    /// When task control was gone.
+    /// Times without task control.
     pub absences: Vec<Span>,
-    /// PIAs that began beside an older one that was still running and might have failed: its path, then theirs.
+    /// PIAs that began beside an older one that was still running and might have failed: the older path, then the younger one.
     pub beside: Vec<(String, String)>,
-    /// What became real, the latest last; as many as are kept.
+    /// The commits, the latest last; limited in number.
     pub commits: VecDeque<Commit>,
     /// Holders and queues.
     pub resources: Resources,
-    /// What became of the instances.
+    /// Numbers of instances by what became of them.
     pub count: Count,
     instances: BTreeMap<InstanceId, Instance>,
     left: fold::Left,
     hints: fold::Hints,
-    /// The event that the commands which follow it were made of.
+    /// The event that caused the commands following it.
     cause: Cause,
     paused: Option<f64>,
-    /// What would have begun, when a breakpoint paused the run.
+    /// The instance that would have begun when a breakpoint paused the run.
     stopped_at: Option<InstanceId>,
-    /// Expanded, and without an outcome.
+    /// Expanded instances without an outcome.
     open: BTreeSet<InstanceId>,
-    /// With a job under way.
+    /// Instances with a job under way.
     at_work: BTreeSet<InstanceId>,
-    /// By path, whose job ended last with a result, and which of its jobs that was.
+    /// By path: the instance whose job ended last with a result, and the index of that job.
     results: BTreeMap<Arc<str>, (InstanceId, usize)>,
-    /// Of the instances that were given away.
+    /// Of the instances that were dropped.
     speculation: Speculation,
     improvements: improvement::Improvements,
 }
 
-/// A time.
+/// An interval of time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Span {
-    /// When it begins.
+    /// Its start.
     pub from_s: f64,
-    /// When it ends.
+    /// Its end.
     pub to_s: f64,
 }
 
 impl Span {
-    /// How long it is.
+    /// Its duration.
     pub fn length_s(&self) -> f64 {
         self.to_s - self.from_s
     }
 }
 
-/// Changes of the root world that became real together.
+/// A commit: changes of the root world that became real together.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Commit {
-    /// When.
+    /// Its time.
     pub at_s: f64,
-    /// The root's revision since.
+    /// The resulting revision of the root.
     pub revision: Revision,
-    /// Who wrote it, by path.
+    /// The path of the writing instance.
     pub writer: String,
-    /// How many facts.
+    /// Number of changed facts.
     pub changes: usize,
 }
 
-/// How many instances there were.
+/// Numbers of instances.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Count {
     /// All of them.
     pub expanded: usize,
-    /// Those that have become real.
+    /// Retired instances.
     pub retired: usize,
-    /// Those that were discarded.
+    /// Squashed (discarded) instances.
     pub squashed: usize,
 }
 
-/// Computing and looking that began before something older had ended.
+/// Computing and detecting that began before an older instance had ended.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Speculation {
-    /// Jobs whose results are real.
+    /// Number of jobs whose results were used.
     pub useful: usize,
-    /// How long those took.
+    /// Total duration of those.
     pub useful_s: f64,
-    /// Jobs whose results were discarded.
+    /// Number of jobs whose results were discarded.
     pub wasted: usize,
-    /// How long those took.
+    /// Total duration of those.
     pub wasted_s: f64,
-    /// Jobs of which it is not known yet.
+    /// Number of jobs whose use is not known yet.
     pub open: usize,
 }
 
@@ -148,11 +148,11 @@ pub struct Speculation {
 pub struct Changed {
     /// The instance that the line is about.
     pub instance: Option<InstanceId>,
-    /// What is held since.
+    /// Holdings that began.
     pub granted: Vec<Holding>,
-    /// What is held no more.
+    /// Holdings that ended.
     pub released: Vec<Holding>,
-    /// Instances that are given away: nothing more will be said of them.
+    /// Instances that are dropped: there will be no more news about them.
     pub left: Vec<Instance>,
 }
 
@@ -163,12 +163,12 @@ impl Default for Timeline {
 }
 
 impl Timeline {
-    /// Nothing has happened yet. Every instance is kept.
+    /// An empty timeline that keeps every instance.
     pub fn new() -> Timeline {
         Timeline::following(usize::MAX)
     }
 
-    /// Nothing has happened yet. Of the instances that have become real or were discarded `keep` are kept.
+    /// An empty timeline that keeps `keep` of the instances that have retired or were squashed.
     pub fn following(keep: usize) -> Timeline {
         Timeline {
             task: String::new(),
@@ -206,12 +206,12 @@ impl Timeline {
         }
     }
 
-    /// Of a whole log.
+    /// The timeline of a whole log.
     pub fn of(lines: &[LogLine]) -> Timeline {
         Timeline::at(lines, f64::INFINITY)
     }
 
-    /// Of a log up to a moment, that moment included.
+    /// The timeline of a log up to a moment, inclusive.
     pub fn at(lines: &[LogLine], moment_s: f64) -> Timeline {
         let mut run = Timeline::new();
         for line in lines.iter().take_while(|line| line.at.seconds() <= moment_s) {
@@ -221,7 +221,7 @@ impl Timeline {
         run
     }
 
-    /// Time has passed without a line, in the robot's seconds.
+    /// Time has passed without a line; in seconds of robot time.
     pub fn wait_until(&mut self, moment_s: f64) {
         self.end_s = self.end_s.max(moment_s);
     }
@@ -231,7 +231,7 @@ impl Timeline {
         self.instances.values()
     }
 
-    /// One of them.
+    /// An instance by its id.
     pub fn instance(&self, id: InstanceId) -> Option<&Instance> {
         self.instances.get(&id)
     }
@@ -241,7 +241,7 @@ impl Timeline {
         self.instances().flat_map(|instance| instance.jobs.iter().map(move |job| (instance, job)))
     }
 
-    /// The instances that a provider is at, with what it does, those that began first first.
+    /// The running instances with their jobs, in the order in which the jobs began.
     pub fn running(&self) -> Vec<(&Instance, &Job)> {
         let at_work = self.at_work.iter().filter_map(|id| self.instances.get(id));
         let mut all: Vec<_> = at_work.filter_map(|one| one.jobs.last().map(|job| (one, job))).collect();
@@ -254,13 +254,13 @@ impl Timeline {
         self.open.first().and_then(|id| self.instances.get(id))
     }
 
-    /// Instances without an outcome that no provider is at, in the order of expansion.
+    /// Instances without an outcome that do not run, in the order of expansion.
     pub fn waiting(&self) -> impl Iterator<Item = &Instance> {
         let waits = |one: &&Instance| matches!(one.stage, Stage::Waiting | Stage::Asking | Stage::Preparing);
         self.open.iter().filter_map(|id| self.instances.get(id)).filter(waits)
     }
 
-    /// Whether no PIA is to begin.
+    /// Whether the run is paused: no PIA may begin.
     pub fn is_paused(&self) -> bool {
         self.paused.is_some()
     }
@@ -270,14 +270,14 @@ impl Timeline {
         self.instance(self.stopped_at?)
     }
 
-    /// What work ahead of time was good for.
+    /// The benefit of speculative work.
     pub fn speculation(&self) -> Speculation {
         let mut all = self.speculation;
         self.instances().for_each(|instance| all.add(instance));
         all
     }
 
-    /// What results gained that got better after they were given.
+    /// The gain from results that improved after they were first given.
     pub fn improvement(&self) -> Improvement {
         self.improvements.total()
     }

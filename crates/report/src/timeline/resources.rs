@@ -1,7 +1,7 @@
-//! Who of a run holds which resource since when, and who has asked for what and stands behind whom.
+//! Holders and queues in a run: which instance holds which resource since when, and which has requested what and waits behind whom.
 //!
-//! It knows what the log tells: the leases of this run, and how many of a kind the system has where that was said at the start. What
-//! others hold is the resource manager's word (`ratn resource list`).
+//! It knows only what the log says: the leases of this run, and the number of resources per kind if the log gives it at the start. For
+//! resources that other runs hold, ask the resource manager (`ratn resource list`).
 
 use super::instance::{Behind, Wait};
 use ratn_model::id::{InstanceId, LeaseId};
@@ -10,10 +10,10 @@ use ratn_model::resource::{Lease, LeasedResource, Quantity, Requirement, Resourc
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
-/// Of a kind so many holders are looked at for those who wait: the last that gave back, and the first of those that still hold.
+/// Maximum number of holders per kind that are considered for a wait: those that released last, and the first of those that still hold.
 const MOST_BEHIND: usize = 64;
 
-/// A resource in the hands of an instance.
+/// A resource held by an instance.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Holding {
     /// The resource's id.
@@ -22,37 +22,37 @@ pub struct Holding {
     pub kind: Arc<str>,
     /// The kinds that its kind is one of.
     superclasses: Arc<[String]>,
-    /// Who has it.
+    /// The instance that holds it.
     pub instance: InstanceId,
     /// The path of that instance.
     pub holder: Arc<str>,
-    /// Since when.
+    /// Start.
     pub from_s: f64,
-    /// Until when; of one that is not over, infinite.
+    /// End; infinite while it is held.
     pub to_s: f64,
 }
 
 impl Holding {
-    /// Whether it is of a kind, or of one of its subclasses.
+    /// Whether its kind is `kind`, or a subclass of that.
     pub fn is_a(&self, kind: &str) -> bool {
         *self.kind == *kind || self.superclasses.iter().any(|superclass| superclass == kind)
     }
 }
 
-/// An instance that has asked and has no answer.
+/// A request without an answer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Asked {
-    /// Who.
+    /// The instance.
     pub instance: InstanceId,
-    /// Since when.
+    /// Time of the request.
     pub from_s: f64,
-    /// Larger goes first.
+    /// Larger priorities are served first.
     pub priority: i64,
-    /// The kinds of which it wants something for itself, room for projections left out.
+    /// The kinds requested, without room for projections.
     pub kinds: Vec<String>,
 }
 
-/// Who holds resources of one kind, and who gave them back last.
+/// The holders of one kind, and those that released last.
 #[derive(Debug, Clone, Default)]
 struct History {
     held: BTreeMap<(InstanceId, Arc<str>), Holding>,
@@ -76,7 +76,7 @@ impl History {
         self.looked_at().next().is_some_and(|(one, _)| one.is_a(kind))
     }
 
-    /// Holders, and whether they have given back.
+    /// The holdings to consider, each with whether it was released.
     fn looked_at(&self) -> impl Iterator<Item = (&Holding, bool)> {
         let held = self.held.values().take(MOST_BEHIND).map(|one| (one, false));
         self.released.iter().map(|one| (one, true)).chain(held)
@@ -87,7 +87,7 @@ impl History {
 #[derive(Debug, Clone, Default)]
 pub struct Resources {
     capacity: BTreeMap<String, Quantity>,
-    /// Every resource that was held once, by id.
+    /// Every resource that was ever held, by id.
     seen: BTreeMap<Arc<str>, Holding>,
     held: BTreeMap<LeaseId, Vec<Holding>>,
     /// By kind.
@@ -100,12 +100,12 @@ impl Resources {
         self.capacity.clone_from(capacity);
     }
 
-    /// What is held, room for projections left out.
+    /// The present holdings, without room for projections.
     pub fn held(&self) -> impl Iterator<Item = &Holding> {
         self.held.values().flatten().filter(|holding| *holding.kind != *WORLD_MODEL)
     }
 
-    /// Who waits for an answer, in the order in which they are served where they want the same.
+    /// The requests without an answer, in the order in which requests for the same resource are served.
     pub fn queue(&self) -> Vec<&Asked> {
         let mut queue: Vec<&Asked> = self.queue.values().collect();
         queue.sort_by(|a, b| {
@@ -114,17 +114,17 @@ impl Resources {
         queue
     }
 
-    /// What an instance has asked for.
+    /// The request of an instance, if it has no answer.
     pub fn asked(&self, instance: InstanceId) -> Option<&Asked> {
         self.queue.get(&instance)
     }
 
-    /// Ids and kinds of what has been held so far, room for projections left out.
+    /// Ids and kinds of all resources held so far, without room for projections.
     pub fn known(&self) -> impl Iterator<Item = (&str, &str)> {
         self.seen.iter().filter(|(_, one)| *one.kind != *WORLD_MODEL).map(|(id, one)| (&**id, &*one.kind))
     }
 
-    /// How many there are of a kind: as was said at the start, or more where more were held.
+    /// Number of resources of a kind: as given at the start, or more if more were held.
     pub fn total(&self, kind: &str) -> usize {
         let seen = self.seen.values().filter(|one| one.is_a(kind)).count();
         seen.max(self.capacity.get(kind).map_or(0, |count| count.units() as usize))
@@ -142,12 +142,12 @@ impl Resources {
         self.queue.insert(instance, Asked { instance, from_s: at_s, priority, kinds });
     }
 
-    /// Asks no more.
+    /// Withdraws an instance's request.
     pub(super) fn withdraws(&mut self, instance: InstanceId) {
         self.queue.remove(&instance);
     }
 
-    /// It has what it asked for. What was held under the same lease until now is over.
+    /// Records a grant. Earlier holdings under the same lease end.
     pub(super) fn grants(
         &mut self,
         instance: InstanceId,
@@ -166,12 +166,12 @@ impl Resources {
         (wait, over)
     }
 
-    /// What is held under a lease.
+    /// The holdings under a lease.
     pub(super) fn held_under(&self, lease: LeaseId) -> &[Holding] {
         self.held.get(&lease).map_or(&[], Vec::as_slice)
     }
 
-    /// Gives back what is held under a lease, and says what that was.
+    /// Ends the holdings under a lease, and returns them.
     pub(super) fn releases(&mut self, lease: LeaseId, at_s: f64) -> Vec<Holding> {
         let mut over = self.held.remove(&lease).unwrap_or_default();
         for holding in &mut over {
@@ -183,13 +183,13 @@ impl Resources {
         over
     }
 
-    /// Everything that is still held at the end of the log.
+    /// Ends and returns all holdings at the end of the log.
     pub(super) fn close(&mut self, at_s: f64) -> Vec<Holding> {
         let leases: Vec<LeaseId> = self.held.keys().copied().collect();
         leases.into_iter().flat_map(|lease| self.releases(lease, at_s)).collect()
     }
 
-    /// How an instance waited that has what it asked for, and for whom: those first who kept it waiting longest.
+    /// The wait of an instance that got its resources, with the holders it waited for, the longest first.
     fn wait(&self, asked: Asked, at_s: f64, granted: &[LeasedResource]) -> Wait {
         let wanted = self.history.values().filter(|history| asked.kinds.iter().any(|kind| history.is_a(kind)));
         let behind = wanted.flat_map(History::looked_at).map(|(one, released)| Behind {
@@ -200,7 +200,7 @@ impl Resources {
             to_s: one.to_s.min(at_s),
             released,
         });
-        // Whoever gave it back before it was asked for, or at that moment, kept nobody waiting.
+        // A holder that released before the request, or at that moment, delayed nobody.
         let mut behind: Vec<Behind> = behind.filter(|one| one.to_s > asked.from_s).collect();
         let overlap_s = |one: &Behind| one.to_s - one.from_s.max(asked.from_s);
         behind.sort_by(|a, b| overlap_s(b).total_cmp(&overlap_s(a)).then(a.instance.cmp(&b.instance)));
@@ -221,7 +221,7 @@ impl Resources {
     }
 }
 
-/// Ids of resources; room for projections is no place where something happens.
+/// Ids of resources, without room for projections, which is not a place of work.
 pub(super) fn named<'a>(resources: impl Iterator<Item = &'a LeasedResource>) -> Vec<String> {
     resources.filter(|one| one.kind != WORLD_MODEL).map(|one| one.id.clone()).collect()
 }

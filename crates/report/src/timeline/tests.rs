@@ -3,7 +3,7 @@
 use super::*;
 use insta::assert_snapshot;
 
-/// Two planners; `plan_approach[3]` and `plan_retract[1]` have both, `plan_transfer[2]` wants one.
+/// Two planners: `plan_approach[3]` and `plan_retract[1]` hold both, `plan_transfer[2]` wants one.
 const TWO_PLANNERS: &str = r#"
 {"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":1,"world":[],"revision":0,"capacity":{"PathPlanner":2}}
 {"at":0,"command":"note","note":"expanded","instance":1,"state":1,"path":"plan_approach[3]","speculative":false}
@@ -43,7 +43,7 @@ fn of_path<'a>(run: &'a Timeline, path: &str) -> &'a Instance {
     run.instances().find(|one| *one.path == *path).unwrap()
 }
 
-/// At a moment: what waits and why, what runs, who holds what and who queues.
+/// The state at a moment: what waits and why, what runs, holders and queues.
 fn looked_at(moment_s: f64) -> String {
     let run = Timeline::at(&lines(TWO_PLANNERS), moment_s);
     let waiting = run.waiting().filter_map(|one| run.explain(one.id));
@@ -129,7 +129,7 @@ fn a_wait_names_those_who_held_what_was_waited_for() {
     plan_retract[1] 4..7 true
     ");
     assert_eq!((wait.kinds.join(","), wait.resources.join(",")), ("PathPlanner".into(), "p2@compute".into()));
-    // Nobody held anything that the first waited for.
+    // No instance held what the first one requested.
     assert_eq!(of_path(&run, "plan_approach[3]").waits[0].behind, []);
 }
 
@@ -189,7 +189,7 @@ fn a_loop_that_decides_is_no_instance_and_nothing_is_ahead_of_it() {
     assert_eq!((run.instances().len(), run.count.expanded, run.oldest_open().is_none()), (0, 0, true));
 }
 
-/// `a` is reached while a breakpoint stands at it; then it is let go, and the breakpoints are otherwise.
+/// The run reaches `a` and stops at the breakpoint there; then it goes on, and the breakpoints change.
 const STOPPED: &str = r#"
 {"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":1,"world":[],"revision":0,"capacity":{},"breakpoints":["a"]}
 {"at":0,"command":"note","note":"expanded","instance":1,"state":1,"path":"a","speculative":false}

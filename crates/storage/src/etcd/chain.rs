@@ -1,14 +1,14 @@
-//! Writes that have an effect once, however often and however late their copies arrive.
+//! Idempotent writes: each has one effect, however many copies of it arrive, and however late.
 //!
 //! ```text
 //!   step N: { leader is mine, the key is as step N-1 left it?  operations, the key says N }
 //!      └── no answer: the same again; if the key says N already, it was performed
 //! ```
-//! A step that was given up without an answer may still be performed, until a later one is. The next step finds it so, by what the key says,
-//! and goes on from there.
+//! A step that was given up without an answer may still be performed, until a later step is. The next step finds that by the value of the
+//! key, and goes on from there.
 //!
-//! A copy of a step that arrives when a later one was performed finds another revision of the key, and does nothing. So nothing but such a
-//! chain changes what a log consists of: one chain over `head` for frames, one over `step` for snapshots and for what they replace.
+//! A copy of a step that arrives after a later step finds another revision of the key, and does nothing. So all changes of a log's keys go
+//! through such a chain: one chain over `head` for frames, one over `step` for snapshots and for what they replace.
 
 use super::format::{Step, parse};
 use super::keys::{found_one, get, put, written_at};
@@ -21,9 +21,9 @@ use bytes::Bytes;
 #[derive(Debug)]
 pub(super) struct Chain {
     key: Bytes,
-    /// When the key was written last; 0 where it is not there.
+    /// The revision at which the key was last written; 0 if the key does not exist.
     revision: i64,
-    /// A step was given up: it may have been performed, or be performed later.
+    /// A step was given up: it may have been performed, or may be performed later.
     undecided: bool,
 }
 
@@ -32,8 +32,8 @@ impl Chain {
         Chain { key, revision, undecided: false }
     }
 
-    /// Performs operations, once. `value` is what the key says then, with the [`Step`] that it is: nothing that it has said before. `perform`
-    /// asks etcd until there is an answer, or gives it up.
+    /// Performs operations, once. `value` is the new value of the key, which contains the [`Step`]; no value may occur twice. `perform`
+    /// asks etcd until there is an answer, or gives up.
     pub(super) fn step(
         &mut self,
         term: &Term,
@@ -58,7 +58,7 @@ impl Chain {
                 return Err(term.deposed());
             }
             match found_one(found.next()) {
-                // A copy was performed whose answer is still on its way, or lost.
+                // A copy was performed whose answer is late, or was lost.
                 Some(kv) if kv.value == value => {
                     (self.revision, self.undecided) = (kv.mod_revision, false);
                     return Ok(());
@@ -76,7 +76,7 @@ impl Chain {
         }
     }
 
-    /// Whether the writer of this term has written it.
+    /// Whether the writer of this term wrote the value.
     fn is_of(&self, term: &Term, value: &[u8]) -> bool {
         parse::<Step>(&self.key, value).is_ok_and(|step| step.epoch == term.epoch.0)
     }
@@ -94,7 +94,7 @@ mod tests {
     use std::collections::BTreeMap;
     use std::sync::Arc;
 
-    /// As much of etcd as a step asks of it.
+    /// A model of etcd, as far as a step needs it.
     #[derive(Default)]
     struct Model {
         revision: i64,
@@ -153,7 +153,7 @@ mod tests {
         let mut chain = Chain::from(keys.step(), 0);
         let value = |step: u64| text(&Step { epoch: 1, step });
         let fault = || Fault::Remote { action: "write to", place: String::new(), what: "no answer".to_owned() };
-        // Two are given up; one of them, or none, arrives in the end.
+        // Two steps are given up; one of them, or none, arrives later.
         for (round, arrives) in [None, Some(0), Some(1)].into_iter().enumerate() {
             let begin = 3 * round as u64;
             let mut given_up = Vec::new();
@@ -175,7 +175,7 @@ mod tests {
                 assert!(!etcd.txn(late).succeeded, "{arrives:?}");
             }
         }
-        // Nobody else may have written there.
+        // No other process may have written the key: the step fails.
         etcd.revision += 1;
         etcd.keys.insert(keys.step(), (value(99), etcd.revision));
         assert!(chain.step(&term, Vec::new(), value(9), |request| Ok(etcd.txn(request))).is_err());
@@ -191,7 +191,7 @@ mod tests {
         let mut chain = Chain::from(keys.head(), 0);
         let mut copies: Vec<TxnRequest> = Vec::new();
         for step in 0..8_u8 {
-            // A frame is put, and later thrown away again, as a compaction does: a late copy would bring it back.
+            // A frame is put, and later deleted, as a compaction does: a late copy of the put would restore it.
             let frame = Bytes::from(format!("frame {}", step / 2));
             let operation = if step % 2 == 0 { put(frame, vec![step]) } else { delete(frame) };
             let answer_is_lost = step % 3 == 0;
@@ -208,7 +208,7 @@ mod tests {
             assert_eq!(etcd.values(), before, "step {step}");
         }
         assert_eq!(etcd.keys[&keys.head()].0, vec![7]);
-        // Somebody else leads: nothing is written any more.
+        // Another process leads: nothing is written any more.
         etcd.revision += 1;
         etcd.keys.insert(keys.leader(), (Bytes::from_static(b"others"), etcd.revision));
         let before = etcd.values();

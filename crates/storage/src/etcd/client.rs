@@ -1,12 +1,12 @@
-//! Asks etcd: the member that answered last, and the next one beside it when that is silent for a moment; the first answer counts.
+//! The client of etcd: asks the member that answered last, and after a short silence the next one, too; the first answer counts.
 //!
-//! A transaction without an answer may have been performed, may be performed later, or never, and one with an answer may be performed
-//! once more: a copy may be late. So every transaction that writes is guarded such that it has no effect twice ([`super::chain`]).
+//! A transaction without an answer may have been performed, may be performed later, or never. One with an answer may be performed once
+//! more, by a late copy. So every transaction that writes is guarded such that it cannot have an effect twice ([`super::chain`]).
 //!
-//! A client is of one cluster: the first that answers it, or the one it is told of ([`Client::pin`]). A member that answers for another
-//! cluster was made anew, or belongs to somebody else: it counts as one that refuses.
+//! A client belongs to one cluster: the first that answers, or the one given to [`Client::pin`]. A member that answers for another cluster
+//! was set up anew, or belongs to another system: it counts as a member that refuses.
 //!
-//! The client has a thread of its own; callers block. A panic in one of its tasks is one of the caller.
+//! The client has a thread of its own; callers block. A panic in one of its tasks is passed on to the caller.
 
 use super::wire::kv_client::KvClient;
 use super::wire::{ResponseHeader, TxnRequest, TxnResponse};
@@ -26,29 +26,29 @@ use tonic::{Code, Status};
 /// Makes the channel to a member of the cluster, by its address. Called within the client's runtime.
 pub type Connect = Arc<dyn Fn(&str) -> Result<Channel, String> + Send + Sync>;
 
-/// The largest answer: a page of frames ([`super::contents`]), with room to spare.
+/// Maximum size of an answer: a page of frames ([`super::contents`]), with room to spare.
 const ANSWER_BYTES: usize = 512 << 20;
-/// A member that has not answered for so long is not waited for alone.
+/// Hedging delay: if a member has not answered within this time, the next one is asked as well.
 const HEDGE: Duration = Duration::from_millis(250);
-/// With every round of all members the next one waits twice as long, up to this.
+/// The delay doubles with every round of all members, up to this.
 const LONGEST_HEDGE: Duration = Duration::from_millis(500);
-/// When one that was asked has failed, the next one is asked after so long.
+/// Delay before the next member is asked after one has failed.
 const FAILED_PAUSE: Duration = Duration::from_millis(50);
 
-/// Why there is no answer.
+/// Why a call failed.
 #[derive(Debug, Clone)]
 pub(super) enum CallError {
-    /// Nobody answered in time: it may have been performed.
+    /// No member answered in time: the call may have been performed.
     Unknown(String),
-    /// etcd has no space. It was not performed.
+    /// etcd has no space. The call was not performed.
     NoSpace,
-    /// It was not performed, and will hardly be.
+    /// The call was not performed, and a retry will hardly help.
     Refused(String),
-    /// It is larger than etcd takes.
+    /// The request exceeds etcd's size limit.
     TooLarge(String),
-    /// Whoever answered is of another cluster.
+    /// The member that answered belongs to another cluster.
     OtherCluster { address: String, known: u64, found: u64 },
-    /// etcd knows less than it did: an old state was put in place of what it had.
+    /// etcd's revision has decreased: an older state was restored.
     WentBack { known: i64, found: i64 },
 }
 
@@ -82,20 +82,20 @@ impl fmt::Display for CallError {
     }
 }
 
-/// A connection to every member.
+/// Connections to every member.
 pub(super) struct Client {
     members: Arc<[Member]>,
-    /// Who answered last.
+    /// The member that answered last.
     current: AtomicUsize,
-    /// etcd's number of the cluster; 0 before the first answer.
+    /// etcd's cluster id; 0 before the first answer.
     cluster: Arc<AtomicU64>,
-    /// The last call was answered by members of another cluster, and by nobody else.
+    /// The last call was answered only by members of another cluster.
     met_others: AtomicBool,
-    /// Since when all calls were that were answered at all, and what the first of them said.
+    /// Since when every answered call was answered only by another cluster, and the first such answer.
     only_others: Mutex<Option<(Instant, CallError)>>,
     /// The highest revision of etcd that was seen.
     seen: AtomicI64,
-    /// The revision that was seen, and the lower one that came after it.
+    /// The highest revision, and the lower one that came after it.
     went_back: OnceLock<(i64, i64)>,
     /// Taken when the client is dropped.
     runtime: Option<Runtime>,
@@ -107,7 +107,7 @@ struct Member {
     channel: Mutex<Option<Channel>>,
 }
 
-/// How long a call waits for an answer, and of how many members it is asked at the most.
+/// How long a call waits for an answer, and how many members it asks at most.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Patience {
     pub(super) answer: Duration,
@@ -121,7 +121,7 @@ impl From<Duration> for Patience {
 }
 
 impl Member {
-    /// The connection of before, or a new one. Called within the client's runtime.
+    /// The existing connection, or a new one. Called within the client's runtime.
     fn channel(&self) -> Result<Channel, String> {
         let mut channel = self.channel.lock().unwrap_or_else(PoisonError::into_inner);
         match &*channel {
@@ -130,7 +130,7 @@ impl Member {
         }
     }
 
-    /// The next call makes a new connection: on this one no answer came, and a connection that lost an answer may never give another.
+    /// The next call makes a new connection: on this one an answer was lost, and a connection that lost an answer may never give another.
     fn forget(&self) {
         *self.channel.lock().unwrap_or_else(PoisonError::into_inner) = None;
     }
@@ -149,22 +149,22 @@ impl Client {
         Ok(Client { members, current, cluster, met_others, only_others, seen, went_back, runtime })
     }
 
-    /// etcd's number of the cluster that counts; nothing before the first answer.
+    /// The id of the cluster that counts; `None` before the first answer.
     pub(super) fn cluster(&self) -> Option<u64> {
         Some(self.cluster.load(Ordering::SeqCst)).filter(|cluster| *cluster != 0)
     }
 
-    /// From now on only this cluster counts, if none does yet.
+    /// Makes this cluster the one that counts, unless there is one already.
     pub(super) fn pin(&self, cluster: u64) {
         let _ = self.cluster.compare_exchange(0, cluster, Ordering::SeqCst, Ordering::SeqCst);
     }
 
-    /// Whether the last call was answered by another cluster alone. Members of this one may have been asked, and silent.
+    /// Whether the last call was answered only by another cluster. Members of this cluster may have been asked without an answer.
     pub(super) fn has_met_others(&self) -> bool {
         self.met_others.load(Ordering::SeqCst)
     }
 
-    /// What each member says by itself, of whichever cluster it is, with its address. Blocks for so long at the most.
+    /// The answer of each member, whatever its cluster, with the member's address. Blocks for at most `patience`.
     pub(super) fn survey(&self, request: &TxnRequest, patience: Duration) -> Vec<(String, Option<TxnResponse>)> {
         let addresses = || self.members.iter().map(|member| member.address.clone());
         let (Some(runtime), members) = (&self.runtime, self.members.clone()) else { return Vec::new() };
@@ -195,7 +195,7 @@ impl Client {
         addresses.join(", ")
     }
 
-    /// Performs a transaction, or says that nobody answered in time. Blocks.
+    /// Performs a transaction, or reports that no member answered in time. Blocks.
     pub(super) fn attempt(&self, request: TxnRequest, patience: impl Into<Patience>) -> Result<TxnResponse, CallError> {
         if let Some(error) = self.went_back() {
             return Err(error);
@@ -207,7 +207,7 @@ impl Client {
         let found = answer.header.as_ref().map_or(0, |header| header.revision);
         if found < known {
             let error = CallError::WentBack { known, found };
-            // For ever: what is missing stays missing when etcd has grown again.
+            // For ever: what is missing stays missing, even when etcd's revision has grown again.
             self.went_back.get_or_init(|| (known, found));
             return Err(error);
         }
@@ -215,35 +215,35 @@ impl Client {
         Ok(answer)
     }
 
-    /// Whether etcd knows less than it did. It stays so for this client.
+    /// Whether etcd's revision has decreased. This stays so for this client.
     pub(super) fn has_gone_back(&self) -> bool {
         self.went_back.get().is_some()
     }
 
-    /// Keeps who has answered.
+    /// Records who has answered.
     fn note(&self, answer: &Result<TxnResponse, CallError>, others: Option<CallError>) {
         self.met_others.store(others.is_some(), Ordering::SeqCst);
         let mut only_others = self.only_others.lock().unwrap_or_else(PoisonError::into_inner);
         match (answer, others) {
             (Ok(_) | Err(CallError::NoSpace), _) => *only_others = None,
             (_, Some(others)) => drop(only_others.get_or_insert((Instant::now(), others))),
-            // Nobody answered.
+            // No member answered.
             _ => {}
         }
     }
 
-    /// That nobody but another cluster has answered for at least so long, if that is so.
+    /// The error that only another cluster has answered for at least `long`, if so.
     pub(super) fn only_others_for(&self, long: Duration) -> Option<CallError> {
         let only_others = self.only_others.lock().unwrap_or_else(PoisonError::into_inner);
         only_others.as_ref().filter(|(since, _)| since.elapsed() >= long).map(|(_, others)| others.clone())
     }
 
-    /// That etcd knows less than it did, if that is so.
+    /// The error that etcd's revision has decreased, if so.
     pub(super) fn went_back(&self) -> Option<CallError> {
         self.went_back.get().map(|(known, found)| CallError::WentBack { known: *known, found: *found })
     }
 
-    /// As [`Client::attempt`], again and again until the deadline: for what may be performed twice.
+    /// As [`Client::attempt`], repeated until the deadline: for transactions that may be performed twice.
     pub(super) fn repeat(
         &self,
         request: &TxnRequest,
@@ -262,7 +262,7 @@ impl Client {
         }
     }
 
-    /// The answer; where there is none, also what a member of another cluster said.
+    /// The answer; without one, also the answer of a member of another cluster.
     fn ask(&self, request: TxnRequest, patience: Patience) -> (Result<TxnResponse, CallError>, Option<CallError>) {
         let unknown = |what: String| (Err(CallError::Unknown(what)), None);
         let (Some(runtime), true) = (&self.runtime, !self.members.is_empty()) else {
@@ -281,17 +281,17 @@ impl Client {
     }
 }
 
-/// What a call has come to.
+/// The result of a call.
 struct Asked {
-    /// Who answered.
+    /// The member that answered.
     by: Option<usize>,
     answer: Result<TxnResponse, CallError>,
-    /// Nobody answered but a member of another cluster.
+    /// Only a member of another cluster answered.
     others: Option<CallError>,
 }
 
-/// Asks one after the other, round and round, each beside those that have not answered yet, and says who answered. A member whose own
-/// leader has just died may hold a transaction for seconds, and perform the next one at once.
+/// Hedged request: asks the members one after the other, in rounds, while earlier ones have not answered; returns the answer and its
+/// member. A member whose own leader has just died may hold a transaction for seconds, and perform the next one at once.
 async fn hedged(
     members: Arc<[Member]>,
     cluster: Arc<AtomicU64>,
@@ -302,9 +302,9 @@ async fn hedged(
     let deadline = Instant::now() + patience.answer;
     let mut last = format!("nobody answered within {} ms", patience.answer.as_millis());
     let mut asked = JoinSet::new();
-    // Who was asked and has not answered.
+    // Members that were asked and have not answered.
     let mut silent = BTreeSet::new();
-    // One member may refuse what the others perform: it counts where nobody else answers.
+    // One member may refuse what the others perform: a refusal counts only if no other member answers.
     let mut refused = BTreeMap::new();
     let mut pause = HEDGE;
     for number in 0.. {
@@ -325,7 +325,7 @@ async fn hedged(
         if (number + 1) % members.len() == 0 {
             pause = (2 * pause).min(LONGEST_HEDGE);
         }
-        // Until the next one is asked, too; sooner where one that was asked has failed.
+        // Wait until the next member is asked; for less time if one that was asked has failed.
         let mut until = deadline.min(Instant::now() + pause);
         while !asked.is_empty() {
             let ended = match tokio::time::timeout_at(until.into(), asked.join_next()).await {
@@ -386,7 +386,7 @@ async fn ask_one(
     (index, answered.and_then(|answer| of_cluster(answer, &cluster, address)))
 }
 
-/// Refuses what another cluster answered than the one that counts; the first counts.
+/// Refuses the answer of another cluster than the one that counts; the first one to answer counts.
 fn of_cluster(answer: TxnResponse, cluster: &AtomicU64, address: String) -> Result<TxnResponse, CallError> {
     let found = cluster_of(answer.header.as_ref());
     match cluster.compare_exchange(0, found, Ordering::SeqCst, Ordering::SeqCst) {
@@ -395,7 +395,7 @@ fn of_cluster(answer: TxnResponse, cluster: &AtomicU64, address: String) -> Resu
     }
 }
 
-/// What a task has come to; nothing where the runtime ends. Its panic goes on in whoever waited for it.
+/// The result of a task; `None` if the runtime ends. A panic is passed on to the caller that waits.
 fn unless_panicked<T>(ended: Result<T, JoinError>) -> Option<T> {
     match ended.map_err(JoinError::try_into_panic) {
         Ok(done) => Some(done),
@@ -404,11 +404,11 @@ fn unless_panicked<T>(ended: Result<T, JoinError>) -> Option<T> {
     }
 }
 
-/// Before a call is tried again, doubled every time up to [`LONGEST_PAUSE`].
+/// Pause before a call is retried; it doubles each time, up to [`LONGEST_PAUSE`].
 pub(super) const FIRST_PAUSE: Duration = Duration::from_millis(10);
 pub(super) const LONGEST_PAUSE: Duration = Duration::from_millis(250);
 
-/// Performs a future in a runtime, and waits for it in this thread, whatever runs there. Nothing where the runtime ends.
+/// Runs a future in a runtime, and blocks this thread until it ends. `None` if the runtime ends.
 fn blocking<T: Send + 'static>(runtime: &Runtime, future: impl Future<Output = T> + Send + 'static) -> Option<T> {
     let (done, result) = mpsc::sync_channel(1);
     let performed = runtime.spawn(future);
@@ -422,19 +422,19 @@ fn classify(status: &Status, address: &str) -> CallError {
     let said = status.message();
     match status.code() {
         Code::ResourceExhausted if said.contains("space exceeded") => CallError::NoSpace,
-        // Out of range: the revision that was asked for has been compacted.
+        // OutOfRange: the requested revision has been compacted.
         Code::InvalidArgument if said.contains("too large") => CallError::TooLarge(format!("{address} says: {said}")),
         Code::InvalidArgument
         | Code::OutOfRange
         | Code::PermissionDenied
         | Code::Unauthenticated
         | Code::Unimplemented => CallError::Refused(format!("{address} says: {said}")),
-        // Also what says that it was not performed: it is tried again anyhow.
+        // Also answers that say the call was not performed: it is retried anyway.
         _ => CallError::Unknown(format!("{address}: {said}")),
     }
 }
 
-/// The cluster that answered.
+/// The id of the cluster that answered.
 pub(super) fn cluster_of(header: Option<&ResponseHeader>) -> u64 {
     header.map_or(0, |header| header.cluster_id)
 }
@@ -447,7 +447,7 @@ impl fmt::Debug for Client {
 
 impl Drop for Client {
     fn drop(&mut self) {
-        // Where it is dropped nobody may be allowed to wait.
+        // The thread that drops the client may not be allowed to block.
         if let Some(runtime) = self.runtime.take() {
             runtime.shutdown_background();
         }

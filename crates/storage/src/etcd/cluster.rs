@@ -1,8 +1,8 @@
-//! Choosing the cluster of etcd where the configured members are not all of one: one of them was made anew and empty, as a cluster of its
-//! own, or an address leads to another etcd.
+//! Chooses the cluster of etcd if not all configured members belong to one: a member was set up anew and empty, as a cluster of its own, or
+//! an address leads to another etcd.
 //!
-//! A client is of one cluster for good. Where several answer when it begins, the one that has the log counts. A log is only begun where
-//! no other cluster could have it: more than half of the members have answered, all of one cluster, and none of them has the log.
+//! A client belongs to one cluster for good. If several answer when it starts, the one that has the log counts. A log is begun only if no
+//! other cluster can have it: more than half of the members have answered, all of one cluster, and none of them has the log.
 
 use super::client::{Client, cluster_of};
 use super::keys::{Keys, found_one, get, look};
@@ -10,17 +10,17 @@ use crate::error::ReadError;
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-/// A member that answers later is taken for one that is not there.
+/// A member that answers later counts as absent.
 const PATIENCE: Duration = Duration::from_millis(900);
 
-/// What a member says.
+/// The answer of a member.
 struct Said {
     address: String,
     cluster: u64,
     has_log: bool,
 }
 
-/// Those that answered, and how many were asked.
+/// The answers, and the number of members asked.
 fn survey(client: &Client, keys: &Keys) -> (Vec<Said>, usize) {
     let answers = client.survey(&look(vec![get(keys.meta())]), PATIENCE);
     let asked = answers.len();
@@ -33,10 +33,10 @@ fn survey(client: &Client, keys: &Keys) -> (Vec<Said>, usize) {
     (said.collect(), asked)
 }
 
-/// Tells a client that has asked nothing yet which cluster counts. Where nobody answers the client finds that out itself.
+/// Tells a client that has not asked yet which cluster counts. If no member answers, the client finds that out itself.
 ///
 /// # Errors
-/// Where several clusters answer, and it cannot be told which of them has the log.
+/// Several clusters answer, and it is unclear which of them has the log.
 pub(super) fn recognise(client: &Client, keys: &Keys) -> Result<(), ReadError> {
     if client.cluster().is_some() {
         return Ok(());
@@ -57,10 +57,10 @@ pub(super) fn recognise(client: &Client, keys: &Keys) -> Result<(), ReadError> {
     Ok(())
 }
 
-/// Refuses to begin a log that may be somewhere else.
+/// Refuses to begin a log that may exist elsewhere.
 ///
 /// # Errors
-/// Why it may be.
+/// Why it may exist elsewhere.
 pub(super) fn may_begin(client: &Client, keys: &Keys) -> Result<(), ReadError> {
     let (said, asked) = survey(client, keys);
     let cluster = client.cluster();

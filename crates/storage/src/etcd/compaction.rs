@@ -1,4 +1,4 @@
-//! Replaces records by a snapshot: parts first, then the one key that makes them count, then what they stand for away.
+//! Replaces records by a snapshot: writes the parts, then the key that makes them count, then deletes the records they replace.
 
 use super::format::{Current, text};
 use super::keys::{delete_span, put};
@@ -24,7 +24,7 @@ impl Compaction {
         let mut result = Reported { shared: &self.shared, result: Err(None) };
         ratn_panic_point::panic_point("etcd-compaction");
         let payload = make();
-        // The snapshot must not know of records that may never be there.
+        // The snapshot must not contain records that may never become durable.
         if Durable::new(self.shared.pending.watch()).wait_blocking(self.through).is_err() {
             return;
         }
@@ -33,11 +33,11 @@ impl Compaction {
 
     fn write(&self, payload: &Bytes) -> Result<(), Fault> {
         let (keys, through) = (&self.shared.term.keys, self.through);
-        // An attempt whose last answer never came may have made it count.
+        // An attempt whose last answer was lost may have made the snapshot count.
         if self.shared.counts(through)? {
             return self.tidy_up();
         }
-        // Parts of an attempt that came to nothing.
+        // Remove parts of a failed attempt.
         self.perform(delete_span(keys.snapshot(through)))?;
         let mut parts = 0;
         for (number, begin) in (0..).zip((0..payload.len()).step_by(self.shared.bounds.part)) {
@@ -50,7 +50,7 @@ impl Compaction {
         self.tidy_up()
     }
 
-    /// Takes away what the snapshot stands for.
+    /// Deletes what the snapshot replaces.
     fn tidy_up(&self) -> Result<(), Fault> {
         let (keys, through) = (&self.shared.term.keys, self.through);
         self.perform(delete_span(keys.snapshots_before(through)))?;
@@ -70,7 +70,7 @@ impl Compaction {
     }
 }
 
-/// Says that the compaction has ended, however it did.
+/// Reports that the compaction has ended, in whatever way.
 struct Reported<'a> {
     shared: &'a Shared,
     result: Result<Position, Option<CompactionFailure>>,

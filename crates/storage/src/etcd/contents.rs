@@ -1,8 +1,8 @@
-//! Reads a log: the snapshot that counts, and the frames behind it up to the head.
+//! Reads a log: the snapshot that counts, and the frames after it up to the head.
 //!
-//! A standby reads along ([`Known`]), so that a new leader only has to read what was written last. Records up to the head never
-//! change; whether they are still the same ones is seen by when the last of them was written. Where a snapshot has taken their place,
-//! everything is read anew.
+//! A standby reads along ([`Known`]), so that a new leader only has to read the newest frames. Records up to the head never change; the
+//! revision at which the last of them was written shows whether they are still the same. If a snapshot has replaced them, everything is
+//! read anew.
 
 use super::client::{CallError, Client};
 use super::format::{Current, Frame, damaged, parse};
@@ -15,38 +15,38 @@ use bytes::{Bytes, BytesMut};
 use crc32c::crc32c;
 use std::time::{Duration, Instant};
 
-/// A page may take so long; one that takes longer is asked for in smaller ones.
+/// Time limit for one page; after it, smaller pages are asked for.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// And all attempts of it.
+/// Time limit for all attempts at one page.
 const REACH: Duration = Duration::from_secs(30);
-/// Keys of the first page. Later ones have as many as make about [`PAGE_BYTES`], judged by the page before.
+/// Number of keys in the first page. Later pages have as many keys as make about [`PAGE_BYTES`], judged by the page before.
 const FIRST_PAGE: i64 = 4;
-/// With parts of a MiB not more than an answer may have.
+/// Maximum number of keys in a page: with parts of 1 MiB, a page stays below the maximum size of an answer.
 const LONGEST_PAGE: i64 = 256;
 const PAGE_BYTES: usize = 4 << 20;
 
-/// What is there, and by which frames.
+/// The contents of a log, and the frames that hold them.
 #[derive(Debug)]
 pub(super) struct Contents {
     pub(super) recovered: Recovered,
-    /// (first, last) of every frame.
+    /// (first, last) record of every frame.
     pub(super) frames: Vec<(Position, Position)>,
     /// The revision of `head`.
     pub(super) head: i64,
 }
 
-/// What was read of a log at one time, to be read on from.
+/// What was read of a log at one time, to be continued later.
 #[derive(Debug)]
 pub(super) struct Known {
     store: u64,
     generation: u64,
     cluster: u64,
-    /// The revision of `head`, and the record that it says.
+    /// The revision of `head`, and the record it names.
     head: (i64, Position),
     snapshot: Option<Snapshot>,
     records: Vec<Record>,
     frames: Vec<(Position, Position)>,
-    /// When the last frame was written: the revision of its first part.
+    /// The revision at which the first part of the last frame was written.
     written: i64,
 }
 
@@ -69,7 +69,7 @@ impl Known {
 }
 
 impl Contents {
-    /// What is known, in the epoch of who leads.
+    /// The known contents, in the epoch of the present leader.
     pub(super) fn of(known: Option<Known>, seen: &Seen) -> Contents {
         let epoch = Epoch(seen.leader.as_ref().map_or(0, |(_, leader)| leader.epoch));
         match known {
@@ -83,7 +83,7 @@ impl Contents {
     }
 }
 
-/// Everything as it was at a revision; at 0, as it is. Nothing where there is no log.
+/// Reads everything at a revision; 0 means the present one. `None` if there is no log.
 pub(super) fn read(
     client: &Client,
     keys: &Keys,
@@ -120,7 +120,7 @@ pub(super) fn read(
     }))
 }
 
-/// What was written since. Nothing where what was known is not what is there.
+/// Reads what was written since. `None` if the log has other contents than what was known.
 fn read_on(client: &Client, keys: &Keys, seen: &Seen, known: Known) -> Result<Option<Known>, ReadError> {
     let (Some((at, head)), Some(&(first, last))) = (seen.head, known.frames.last()) else { return Ok(None) };
     let head = (at, Position(head.position));
@@ -131,7 +131,7 @@ fn read_on(client: &Client, keys: &Keys, seen: &Seen, known: Known) -> Result<Op
     let mut is_the_same = false;
     pages(client, span, 0, |kv| {
         is_the_same |= kv.key == begin && kv.mod_revision == written;
-        // The parts of the last frame that is known come once more.
+        // The parts of the last known frame are read once more.
         if kv.key < behind || !is_the_same { Ok(()) } else { reading.add(store, kv) }
     })?;
     if !is_the_same {
@@ -146,7 +146,7 @@ struct Reading {
     records: Vec<Record>,
     frames: Vec<(Position, Position)>,
     frame: Option<Frame>,
-    /// When the first part of the newest frame was written.
+    /// The revision at which the first part of the newest frame was written.
     written: i64,
 }
 
@@ -168,13 +168,13 @@ impl Reading {
             return Err(damaged(&key, &format!("records {} to {first} are missing before it", self.last.next())));
         }
         self.frames.push((first, end));
-        // What a snapshot stands for may still be there.
+        // Records that a snapshot replaces may still exist.
         self.records.extend(records.into_iter().filter(|record| record.position > self.last));
         self.last = self.last.max(end);
         Ok(())
     }
 
-    /// With everything up to the head.
+    /// The complete contents up to the head, or an error.
     fn whole(self, keys: &Keys, head: Position) -> Result<Reading, ReadError> {
         if self.frame.is_some() || self.last < head {
             let what = format!("its head is record {head}, and {} is the last that is there", self.last);

@@ -1,9 +1,9 @@
-//! Version 1 of what stands in etcd. What is small is JSON, for people with `etcdctl`; frames are bytes, their numbers little-endian.
+//! Format version 1 of the keys in etcd. Small values are JSON, readable with `etcdctl`; frames are bytes, with little-endian numbers.
 //!
 //! ```text
 //!   meta      {"version":1, "store":N, "cluster":N, "generation":N, "accepted":N}
-//!             the log's number, etcd's own of the cluster, the generation (0; a copy's is the seconds since 1970; one more whenever an
-//!             older state is accepted), and behind which record one was accepted last
+//!             the log's number, etcd's cluster id, the generation (0; of a copy, the seconds since 1970; plus one whenever an
+//!             older state is accepted), and the record after which an older state was last accepted
 //!   leader    {"epoch":N, "holder":{…} or null, "draw":N}
 //!   head      {"position":N, "epoch":N, "step":N}
 //!   step      {"epoch":N, "step":N}
@@ -21,41 +21,41 @@ use crc32c::{crc32c, crc32c_append};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-/// The version that is written.
+/// The version that this program writes.
 pub(super) const VERSION: u32 = 1;
-/// Before the bytes of a frame's first part.
+/// Size of the header before the bytes of a frame's first part.
 pub(super) const FRAME_HEADER: usize = 36;
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Meta {
     pub(super) version: u32,
-    /// Drawn when the log was made.
+    /// A random number drawn when the log was made.
     pub(super) store: u64,
-    /// etcd's number of its cluster: another one after a snapshot of etcd was restored.
+    /// etcd's cluster id: it differs after a snapshot of etcd was restored.
     pub(super) cluster: u64,
-    /// Grows with every copy, and with every older state that was put in place and accepted.
+    /// Grows with every copy, and with every older state that was restored and accepted.
     #[serde(default)]
     pub(super) generation: u64,
-    /// The last record that the state had when it was accepted.
+    /// The last record of the state that was accepted.
     #[serde(default)]
     pub(super) accepted: Option<u64>,
 }
 
-/// Who has the writer's place.
+/// The process that has the writer's place.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Holder {
-    /// Where it can be reached.
+    /// The address at which it can be reached.
     pub address: String,
-    /// What it is, for people.
+    /// A description for people.
     pub about: String,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Leader {
     pub(super) epoch: u64,
-    /// Nobody where it was given up.
+    /// `None` if the place was given up.
     pub(super) holder: Option<Holder>,
-    /// By which who wrote it knows it again.
+    /// A random number by which the writer of this value recognises it.
     pub(super) draw: u64,
 }
 
@@ -63,7 +63,7 @@ pub(super) struct Leader {
 pub(super) struct Head {
     pub(super) position: u64,
     pub(super) epoch: u64,
-    /// Counted within the epoch: no value comes twice.
+    /// A counter within the epoch, so that no value occurs twice.
     pub(super) step: u64,
 }
 
@@ -87,13 +87,13 @@ impl Leader {
     }
 }
 
-/// As JSON.
+/// Encodes as JSON.
 pub(super) fn text(value: &impl Serialize) -> Bytes {
-    // Numbers, strings and structs of them: nothing that JSON lacks.
+    // The values are numbers, strings and structs of them, which JSON can always represent.
     Bytes::from(serde_json::to_vec(value).unwrap_or_default())
 }
 
-/// From JSON.
+/// Decodes JSON.
 pub(super) fn parse<T: DeserializeOwned>(key: &Bytes, value: &[u8]) -> Result<T, ReadError> {
     serde_json::from_slice(value).map_err(|error| damaged(key, &error.to_string()))
 }
@@ -102,7 +102,7 @@ pub(super) fn damaged(key: &Bytes, what: &str) -> ReadError {
     ReadError::Damaged { place: String::from_utf8_lossy(key).into_owned(), offset: 0, what: what.to_owned() }
 }
 
-/// Records as parts of at most so many bytes, for as many keys.
+/// Encodes records as parts of at most `most` bytes, one per key.
 pub(super) fn encode_frame(store: u64, first: Position, count: u32, records: &[u8], most: usize) -> Vec<Bytes> {
     let (begin, rest) = records.split_at(records.len().min(most.saturating_sub(FRAME_HEADER)));
     let rest: Vec<&[u8]> = rest.chunks(most).collect();
@@ -112,7 +112,7 @@ pub(super) fn encode_frame(store: u64, first: Position, count: u32, records: &[u
     part.put_u64_le(first.0);
     part.put_u32_le(count);
     part.put_u64_le(records.len() as u64);
-    // At most as many as its bytes.
+    // There are at most as many parts as bytes.
     part.put_u32_le(u32::try_from(1 + rest.len()).unwrap_or(u32::MAX));
     part.put_slice(begin);
     let mut parts = vec![part.freeze()];
@@ -120,7 +120,7 @@ pub(super) fn encode_frame(store: u64, first: Position, count: u32, records: &[u
     parts
 }
 
-/// A frame that is being read, part by part.
+/// A frame that is read part by part.
 #[derive(Debug)]
 pub(super) struct Frame {
     key: Bytes,
@@ -135,7 +135,7 @@ pub(super) struct Frame {
 }
 
 impl Frame {
-    /// Its first part.
+    /// Begins with the first part.
     pub(super) fn begin(key: Bytes, store: u64, mut value: Bytes) -> Result<Frame, ReadError> {
         if value.len() < FRAME_HEADER {
             return Err(damaged(&key, "it is too short for a frame"));
@@ -155,7 +155,7 @@ impl Frame {
         if frame.store != store { Err(damaged(&frame.key, "it is of another log")) } else { Ok(frame) }
     }
 
-    /// The next part.
+    /// Adds the next part.
     pub(super) fn add(&mut self, part: &[u8]) {
         self.read += 1;
         self.records.put_slice(part);
@@ -169,7 +169,7 @@ impl Frame {
         self.read >= self.parts
     }
 
-    /// Its records, in order.
+    /// The records of the frame, in order.
     pub(super) fn records(self) -> Result<Vec<Record>, ReadError> {
         let Frame { key, crc, store, first, count, bytes, records, .. } = self;
         if records.len() != bytes || checksum(store, first, count, &records) != crc {
@@ -238,7 +238,8 @@ mod tests {
         for at in 0..whole.len() {
             let mut bytes = whole.to_vec();
             bytes[at] ^= 1;
-            // The number of parts is not in the checksum: one more is never whole, and none fewer is there.
+            // The number of parts is not in the checksum: a larger number makes the frame incomplete, and a smaller one does not occur
+            // here.
             if !(32..36).contains(&at) {
                 assert!(read(&[Bytes::from(bytes)]).is_err(), "byte {at}");
             }

@@ -1,19 +1,19 @@
-//! The keys in etcd, and how a transaction of them is written.
+//! The keys in etcd, and helpers that build transactions of them.
 //!
 //! ```text
-//!   PREFIX/meta                       which log this is, and of which format
-//!   PREFIX/leader                     who leads; written when somebody takes the place, and when it is given up
-//!   PREFIX/alive                      written again and again by who leads
-//!   PREFIX/writable                   there as long as who leads can write `alive`
+//!   PREFIX/meta                       the log's identity and format version
+//!   PREFIX/leader                     the leader; written when the place is taken, and when it is given up
+//!   PREFIX/alive                      written regularly by the leader
+//!   PREFIX/writable                   exists as long as the leader can write `alive`
 //!   PREFIX/head                       the last record that counts
-//!   PREFIX/step                       how often a snapshot, or what it replaces, or one of the next two was changed
-//!   PREFIX/unfinished                 until a copy counts; says where its source was moved to, as `moved` does there, when all is there
-//!   PREFIX/moved                      where all of it was moved to
-//!   PREFIX/log/POSITION/PART          a frame of records, by the first of them
-//!   PREFIX/snapshot/current           which snapshot counts
-//!   PREFIX/snapshot/THROUGH/PART      a snapshot
+//!   PREFIX/step                       number of changes of a snapshot, of what it replaces, or of one of the next two keys
+//!   PREFIX/unfinished                 exists until a copy counts; in a complete copy, the same text as `moved` in its source
+//!   PREFIX/moved                      the place to which the log was moved
+//!   PREFIX/log/POSITION/PART          a part of a frame, by the position of its first record
+//!   PREFIX/snapshot/current           the snapshot that counts
+//!   PREFIX/snapshot/THROUGH/PART      a part of a snapshot
 //! ```
-//! Positions and parts have as many digits as the largest, so that keys are in the order of what they stand for.
+//! Positions and parts have a fixed number of digits, so that the order of the keys is the order of positions and parts.
 
 use super::wire::{
     Compare, DeleteRangeRequest, KeyValue, PutRequest, RangeRequest, RequestOp, compare, request_op, response_op,
@@ -28,7 +28,7 @@ pub(super) struct Keys {
     prefix: String,
 }
 
-/// A range of keys, its end not included.
+/// A half-open range of keys.
 pub(super) type Span = (Bytes, Bytes);
 
 impl Keys {
@@ -80,7 +80,7 @@ impl Keys {
         self.key(&format!("log/{:020}/{part:06}", first.0))
     }
 
-    /// Every frame whose first record is one of these.
+    /// Every frame whose first record is in this range.
     pub(super) fn frames(&self, from: Position, before: Position) -> Span {
         (self.key(&format!("log/{:020}", from.0)), self.key(&format!("log/{:020}", before.0)))
     }
@@ -99,12 +99,12 @@ impl Keys {
         (self.key(&format!("snapshot/{:020}/", through.0)), self.key(&format!("snapshot/{:020}0", through.0)))
     }
 
-    /// Every part of every older snapshot.
+    /// Every part of all older snapshots.
     pub(super) fn snapshots_before(&self, through: Position) -> Span {
         (self.key("snapshot/0"), self.key(&format!("snapshot/{:020}", through.0)))
     }
 
-    /// Every part of every younger snapshot; `current` is behind all of them.
+    /// Every part of all newer snapshots; `current` sorts after all of them.
     pub(super) fn snapshots_after(&self, through: Position) -> Span {
         (self.key(&format!("snapshot/{:020}", through.next().0)), self.key("snapshot/c"))
     }
@@ -114,7 +114,7 @@ impl Keys {
     }
 }
 
-/// Holds if the key was last written at this revision; at 0, if it is not there.
+/// A condition: the key was last written at this revision; 0: the key does not exist.
 pub(super) fn written_at(key: Bytes, revision: i64) -> Compare {
     Compare {
         result: compare::CompareResult::Equal.into(),
@@ -144,12 +144,12 @@ pub(super) fn delete_span((key, range_end): Span) -> RequestOp {
     op(request_op::Request::RequestDeleteRange(DeleteRangeRequest { key, range_end }))
 }
 
-/// Only looks.
+/// A read-only transaction.
 pub(super) fn look(success: Vec<RequestOp>) -> TxnRequest {
     TxnRequest { success, ..TxnRequest::default() }
 }
 
-/// What a range found; nothing where the operation was another one.
+/// The keys that a range request found; none if the operation was another one.
 pub(super) fn found(response: Option<ResponseOp>) -> (Vec<KeyValue>, bool) {
     match response.and_then(|response| response.response) {
         Some(response_op::Response::ResponseRange(range)) => (range.kvs, range.more),

@@ -1,35 +1,34 @@
-//! The newest position of a log that this host has seen, in a file of its own: by that an older state of etcd is recognised which was put in place of
-//! the one that there was. Nothing else depends on the file. Without it, only the number of etcd's cluster tells, and what this process has
-//! seen itself.
+//! The newest position of a log that this host has seen, in a file: by it, this host recognises that an older state of etcd was restored.
+//! Nothing else depends on the file. Without it, only etcd's cluster id and what this process itself has seen can show that.
 //!
-//! Accepting an older state begins a generation of the log, and so does a copy of one. A later generation takes the place of what was seen of an earlier one, so
-//! it is accepted once, by one host, for all.
+//! Accepting an older state begins a new generation of the log, and so does copying a log. A later generation supersedes what was seen of
+//! an earlier one, so a state is accepted once, by one host, for all.
 
 use super::term::Seen;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// See the module. Clones share what is known.
+/// See the module. Clones share their knowledge.
 #[derive(Debug, Clone)]
 pub(super) struct Mark {
-    /// Nothing is kept without.
+    /// `None`: nothing is kept on disk.
     file: Option<PathBuf>,
     known: Arc<Mutex<Option<Known>>>,
 }
 
-/// What stands in the file.
+/// The content of the file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct Known {
     #[serde(flatten)]
     highest: Height,
-    /// etcd went back under the eyes of this host: how much is missing is not known, and no height of this generation or an earlier one
-    /// shows that nothing is.
+    /// etcd's revision decreased while this host was watching: it is unknown how much is missing, and no height of this generation or an
+    /// earlier one shows that nothing is.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     doubted: Option<u64>,
 }
 
-/// Grows, as long as it is of one log.
+/// The newest state of a log that was seen; it only grows within one log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Height {
     pub(super) store: u64,
@@ -40,7 +39,7 @@ pub(super) struct Height {
 }
 
 impl Height {
-    /// Nothing where there is no log.
+    /// `None` if there is no log.
     pub(super) fn of(seen: &Seen) -> Option<Height> {
         let meta = seen.meta.as_ref()?;
         let epoch = seen.leader.as_ref().map_or(0, |(_, leader)| leader.epoch);
@@ -48,7 +47,7 @@ impl Height {
         Some(Height { store: meta.store, generation: meta.generation, epoch, position })
     }
 
-    /// Whether it has all that the other one had, as far as heights tell, or the lack of it was accepted.
+    /// Whether this state contains everything of the other one, as far as heights tell, or a loss was accepted.
     fn reaches(self, known: Height) -> bool {
         let of_the_same = (self.store, self.generation) == (known.store, known.generation);
         self.generation > known.generation
@@ -63,27 +62,27 @@ impl Mark {
         Mark { file, known: Arc::new(Mutex::new(known)) }
     }
 
-    /// Whether this host has seen more than there is, or another log.
+    /// Whether this host has seen more than `there`, or another log.
     pub(super) fn is_above(&self, there: Option<Height>) -> bool {
         let Some(known) = *self.known() else { return false };
         let Some(there) = there else { return true };
         !there.reaches(known.highest) || known.doubted.is_some_and(|doubted| there.generation <= doubted)
     }
 
-    /// The generation that begins where somebody accepts what is there.
+    /// The generation that begins if the present state is accepted.
     pub(super) fn next_generation(&self, there: Option<Height>) -> u64 {
         let known = self.known().map(|known| known.highest.generation);
         known.max(there.map(|there| there.generation)).unwrap_or(0) + 1
     }
 
-    /// Keeps it.
+    /// Records a height.
     pub(super) fn keep(&self, height: Height) {
         let mut known = self.known();
         let doubted = known.and_then(|known| known.doubted).filter(|doubted| *doubted >= height.generation);
         self.replace(&mut known, Known { highest: height, doubted });
     }
 
-    /// etcd went back: what is there is not taken for all that there was, whatever its height.
+    /// etcd's revision has decreased: the present state does not count as complete any more, whatever its height.
     pub(super) fn doubt(&self) {
         let mut known = self.known();
         if let Some(before) = *known {
@@ -91,7 +90,7 @@ impl Mark {
         }
     }
 
-    /// A file that cannot be written is told of, and no more: it is only a help.
+    /// A failed write of the file is only logged, because the file is only an aid.
     fn replace(&self, known: &mut Option<Known>, new: Known) {
         if known.replace(new) == Some(new) {
             return;

@@ -1,13 +1,13 @@
-//! The log in etcd: for those who cannot have it stop when a host does.
+//! The log in etcd: for systems that must go on when a host fails.
 //!
 //! ```text
 //!   Etcd ──open──▶ Term (the place: taken, kept, given up) ──guards──▶ Writing: frames and head, one transaction at a time
 //!                                                        └──guards──▶ Compaction: snapshot, then old frames away
 //! ```
-//! Several processes may try to open one log; one has the writer's place, the others are refused with who it is, and try again. A writer
-//! that says nothing for a second loses the place to whoever asks next. Nothing of consensus is here: etcd decides the order of
-//! transactions, and every write of a frame or a snapshot is a transaction that compares the revision of `leader` and what the write before
-//! it left (`chain.rs`). So a writer that was got past writes nothing, and no transaction has an effect twice.
+//! Several processes may try to open one log; one has the writer's place, the others are refused with the name of the holder, and retry. A
+//! writer that is silent for a second loses the place to the next process that asks. This module implements no consensus: etcd decides the
+//! order of transactions, and every write of a frame or a snapshot is a transaction that compares the revision of `leader` and the result
+//! of the write before it (`chain.rs`). So a superseded writer writes nothing, and no transaction has an effect twice.
 //!
 //! etcd keeps every version of every key until it is compacted: run it with `--auto-compaction-retention`.
 
@@ -51,23 +51,23 @@ use term::{Seen, Term, unreadable};
 use wire::TxnRequest;
 use writer::{EtcdWriter, Renewing, Shared};
 
-/// Where a log in etcd is, and who opens it.
+/// The options of a log in etcd, and of the process that opens it.
 #[derive(Clone)]
 pub struct EtcdOptions {
     /// The addresses of etcd's members.
     pub endpoints: Vec<String>,
-    /// How each of them is reached.
+    /// Makes the connection to a member.
     pub connect: Connect,
-    /// Before every key of the log, as `/ratn/cell-7/resource-manager`. Nobody else may use it.
+    /// The prefix of every key of the log, for example `/ratn/cell-7/resource-manager`. No other program may use it.
     pub prefix: String,
-    /// Who opens it, as others are told.
+    /// The process that opens the log, as others see it.
     pub holder: Holder,
-    /// Bounds.
+    /// Size limits.
     pub bounds: Bounds,
-    /// Where this host keeps what it has seen of the log at the most; nothing is kept without.
+    /// The file in which this host keeps the newest state of the log that it has seen; `None`: nothing is kept.
     pub mark: Option<PathBuf>,
-    /// Opens the log also where an older state of etcd was restored, once: what was acknowledged since then is gone. The generation that
-    /// begins with it, as [`OpenError::Restored`] says.
+    /// Opens the log even if an older state of etcd was restored, once: what was acknowledged since then is lost. The value is the
+    /// generation that begins by it, from [`OpenError::Restored`].
     pub accept_restored: Option<u64>,
 }
 
@@ -81,20 +81,20 @@ pub struct Etcd {
     standby: Mutex<Standby>,
 }
 
-/// What is known while somebody else has the place.
+/// The state of a standby, while another process has the place.
 #[derive(Debug, Default)]
 struct Standby {
     silence: Option<Silence>,
-    /// As much of the log as was read.
+    /// The part of the log that was read.
     known: Option<Known>,
-    /// When it could not be read.
+    /// When reading failed last.
     failed: Option<Instant>,
-    /// What was found is not the log that there was, or may not be: it is looked anew which cluster has it.
+    /// What was found is not the expected log, or may not be: the cluster has to be chosen anew.
     refused: bool,
 }
 
 impl Standby {
-    /// Reads on, so that little is left to be read when the place is taken.
+    /// Reads on, so that little is left to read when the place is taken.
     fn follow(known: &mut Option<Known>, failed: &mut Option<Instant>, client: &Client, keys: &Keys, seen: &Seen) {
         if failed.is_some_and(|at| at.elapsed() < FOLLOW_AGAIN) {
             return;
@@ -102,7 +102,7 @@ impl Standby {
         match contents::read(client, keys, seen, 0, known.take()) {
             Ok(read) => (*known, *failed) = (read, None),
             Err(error) => {
-                // Read in the middle of a compaction, for one.
+                // For example, it was read in the middle of a compaction.
                 tracing::debug!(%error, "the log is not followed for now");
                 *failed = Some(Instant::now());
             }
@@ -111,10 +111,10 @@ impl Standby {
 }
 
 impl Etcd {
-    /// The log of these options. Nothing is asked of etcd yet.
+    /// A log with these options. Does not ask etcd yet.
     ///
     /// # Errors
-    /// Where the options contradict each other, or the system refuses a thread.
+    /// The options contradict each other, or the system cannot start a thread.
     pub fn new(options: EtcdOptions) -> Result<Etcd, OpenError> {
         let rule = |kept: bool, what: &str| match kept {
             true => Ok(()),
@@ -134,24 +134,25 @@ impl Etcd {
         Ok(Etcd { options, keys, client, mark, standby: Mutex::default() })
     }
 
-    /// Who has the writer's place, as etcd says; it may have left without a word. Blocks.
+    /// The holder of the writer's place according to etcd; the holder may have gone without giving it up. Blocks.
     ///
     /// # Errors
-    /// Where etcd does not answer.
+    /// etcd does not answer.
     pub fn holder(&self) -> Result<Option<Holder>, ReadError> {
         Ok(Seen::look(&*self.client()?, &self.keys)?.leader.and_then(|(_, leader)| leader.holder))
     }
 }
 
 impl Etcd {
-    /// That knows its cluster, as far as anybody answers.
+    /// The client, with its cluster chosen if any member answers.
     fn client(&self) -> Result<Arc<Client>, ReadError> {
         let client = self.client.lock().unwrap_or_else(PoisonError::into_inner).clone();
         cluster::recognise(&client, &self.keys)?;
         Ok(client)
     }
 
-    /// Where etcd went back, or is another cluster, whoever writes with the client of before never writes again. Who opens the log looks at what is there now.
+    /// If etcd's revision decreased, or another cluster counts now, a writer with the old client never writes again. A process that opens
+    /// the log uses a new client.
     fn client_of_now(&self, standby: &mut Standby) -> Result<Arc<Client>, OpenError> {
         let mut client = self.client.lock().unwrap_or_else(PoisonError::into_inner);
         if client.has_gone_back() {
@@ -166,7 +167,7 @@ impl Etcd {
         Ok(client)
     }
 
-    /// The generation that begins, where an older state was put in place and accepting it is asked for.
+    /// The generation that begins, if an older state was restored and is to be accepted.
     fn accepted(&self, vacant: &Seen) -> Result<Option<u64>, OpenError> {
         if !vacant.is_restored(&self.mark) {
             return Ok(None);
@@ -178,7 +179,7 @@ impl Etcd {
         }
     }
 
-    /// Reads what is there, and throws away what predecessors had begun and nobody was told of.
+    /// Reads the log, and removes unfinished writes of predecessors, which were never acknowledged.
     fn begin(&self, term: &Arc<Term>, known: Option<Known>) -> Result<(Recovered, Shared, Chain), OpenError> {
         let client = &term.client;
         let seen = Seen::look(client, &self.keys)?;
@@ -219,7 +220,7 @@ impl Store for Etcd {
         let mut standby = self.standby.lock().unwrap_or_else(PoisonError::into_inner);
         let client = self.client_of_now(&mut standby)?;
         let Standby { silence, known, failed, refused } = &mut *standby;
-        // Who only asks once whether there is a writer reads nothing.
+        // A process that asks only once whether there is a writer does not read the log.
         let stands_by = silence.is_some();
         let vacant = term::await_vacancy(&client, &self.keys, silence, &self.mark, |seen| {
             if stands_by {
@@ -234,17 +235,17 @@ impl Store for Etcd {
         }
         let taken = term::take(&client, &self.keys, &vacant, &self.options.holder, accepts);
         if taken.is_err() {
-            // The holder may not have been able to say that it is there, as we were not: silence counts from now on.
+            // The holder may have been unable to renew, as this process was: silence counts from now on.
             *silence = None;
         }
         let term = Arc::new(taken?);
         if accepts.is_some() {
             self.mark.keep(Height { store: term.store, generation: term.generation, epoch: term.epoch.0, position: 0 });
         }
-        // From now on: what is there may take longer to read than the place waits.
+        // Renew from now on: reading the log may take longer than the place lasts without renewal.
         let renewing = Renewing::start(term.clone(), self.mark.clone()).map_err(|error| self.system(error))?;
         let begun = self.begin(&term, known.take()).map_err(|error| match term.renew() {
-            // What was read in the middle of another one's changes means nothing.
+            // What was read during another writer's changes has no meaning.
             Err(Fault::Deposed { .. }) => self.held("somebody who took it just now"),
             _ => error,
         });
@@ -260,7 +261,7 @@ impl Store for Etcd {
             let client = self.client()?;
             let seen = Seen::look(&client, &self.keys)?.whole(&self.keys)?;
             match contents::read(&client, &self.keys, &seen, seen.revision, None) {
-                // etcd may compact that revision away while it is read.
+                // etcd may compact this revision while it is being read.
                 Err(ReadError::Remote { .. }) if attempt < READ_ATTEMPTS => attempt += 1,
                 read => return Ok(Contents::of(read?, &seen).recovered),
             }
@@ -274,7 +275,7 @@ impl Store for Etcd {
         let compare = vec![written_at(self.keys.unfinished(), *written)];
         let success = vec![delete(self.keys.unfinished())];
         let request = TxnRequest { compare, success, failure: Vec::new() };
-        // Where it is not as it was any more, an earlier attempt or the copier itself has taken the mark away, or somebody has emptied the place.
+        // If the mark is not as expected any more, an earlier attempt or the copying process has removed it, or the place was emptied.
         let answer = client.repeat(&request, term::PATIENCE, Instant::now() + REACH);
         answer.map_err(|error| unreadable(&client, &error))?;
         let seen = Seen::look(&client, &self.keys)?.whole(&self.keys)?;
@@ -292,11 +293,11 @@ fn connected(options: &EtcdOptions) -> Result<Arc<Client>, OpenError> {
     Ok(Arc::new(client.map_err(|source| OpenError::Io { action: "start a thread for", place, source })?))
 }
 
-/// How often a whole log is read at one revision of etcd before it is given up.
+/// Number of attempts to read a whole log at one revision of etcd.
 const READ_ATTEMPTS: u32 = 3;
-/// A standby that could not read the log tries it again after so long.
+/// Pause after which a standby retries reading the log.
 const FOLLOW_AGAIN: std::time::Duration = std::time::Duration::from_secs(1);
-/// Attempts of what is done once, when the log is opened.
+/// Time limit for the single operations when the log is opened.
 const REACH: std::time::Duration = std::time::Duration::from_secs(10);
 
 impl fmt::Debug for EtcdOptions {

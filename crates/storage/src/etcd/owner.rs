@@ -1,14 +1,14 @@
-//! Watches whether the owner of a writer takes its turns. A process whose core hangs must not keep the place, whatever its other threads do.
-//! Pure: what the owner has counted and when it was looked at in, a verdict out.
+//! Watches whether the owner of a writer takes its turns. A process whose core hangs must not keep the place, whatever its other threads
+//! do. Pure: turn counts and times in, a verdict out.
 //!
-//! Between two looks only so much counts: who was suspended with everything else, or waited for a slow etcd with this thread, has not hung.
-//! Before its first turn (a long log is read) nothing counts.
+//! Only a bounded part of the time between two checks counts: a process that was suspended as a whole, or whose thread here waited for a
+//! slow etcd, has not hung. Before the owner's first turn (while a long log is read) no time counts.
 
 use std::time::{Duration, Instant};
 
-/// An owner that has taken no turn for so long hangs. It takes one every 0.1 s.
+/// An owner without a turn for this long hangs. It usually takes one every 0.1 s.
 pub(super) const LONGEST_TURN: Duration = Duration::from_secs(2);
-/// No pause between two looks counts for more.
+/// Maximum time that counts between two checks.
 const MOST_COUNTED: Duration = Duration::from_millis(500);
 
 /// See the module.
@@ -24,7 +24,7 @@ impl Owner {
         Owner { turns: None, quiet: Duration::ZERO, looked: now }
     }
 
-    /// One more look: how many turns it has taken, nothing before the first. Whether it hangs.
+    /// One more check, with the number of turns so far (`None` before the first); returns whether the owner hangs.
     pub(super) fn hangs(&mut self, turns: Option<u64>, now: Instant) -> bool {
         let passed = now.saturating_duration_since(self.looked).min(MOST_COUNTED);
         let takes_none = turns.is_some() && turns == self.turns;
@@ -38,7 +38,7 @@ impl Owner {
 mod tests {
     use super::*;
 
-    /// The verdicts of looks of which each comes so many milliseconds after the one before.
+    /// The verdicts of checks; each is given with its delay after the previous one, in milliseconds.
     fn looks(looks: &[(u64, Option<u64>)]) -> Vec<bool> {
         let mut now = Instant::now();
         let mut owner = Owner::since(now);

@@ -1,25 +1,25 @@
 //! How long the leader has been silent, as seen by a standby. Pure: observations and their times in, a verdict out.
 //!
-//! Silence counts only while etcd answers: what counts of a pause between two looks is bounded, and with a longer one it begins anew. That is
-//! for the sake of a holder that could not speak either. Whether the place may be taken is decided by the transaction that takes it: it
-//! compares all that was the same for so long.
+//! Silence counts only while etcd answers: the time that counts between two checks is bounded, and after a longer pause silence begins
+//! anew. This protects a holder that could not write either. Whether the place may be taken is decided by the transaction that takes it: it
+//! compares all keys that have been unchanged for so long.
 
 use std::time::{Duration, Instant};
 
-/// A holder that has not written for so long has left. Longer than what a confirmation holds for those who ask
+/// A holder that has not written for this long has gone. Longer than the validity of a confirmation by
 /// [`Place::check`](crate::Place::check).
 pub(super) const SILENCE: Duration = Duration::from_millis(1_050);
-/// No pause between two looks counts for more: less than [`SILENCE`], so that a holder has a moment when etcd is back.
+/// Maximum time that counts between two checks: less than [`SILENCE`], so that a holder has a moment to write when etcd is back.
 const MOST_COUNTED: Duration = Duration::from_millis(500);
-/// Longer than any look takes that is answered in time. With a longer pause silence begins anew.
+/// Longer than any check that is answered in time. After a longer pause silence begins anew.
 const LONGEST_PAUSE: Duration = Duration::from_millis(1_000);
 
-/// When the keys were written by which a holder is seen to be there; 0 for one that is not there.
+/// The revisions of the keys that show that a holder is alive; 0 for a key that does not exist.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Signs {
     pub(super) leader: i64,
     pub(super) alive: i64,
-    /// Taken away by a holder that cannot write `alive`.
+    /// Deleted by a holder that cannot write `alive`.
     pub(super) writable: i64,
 }
 
@@ -31,21 +31,21 @@ pub(super) struct Silence {
     looked: Instant,
 }
 
-/// What a look has shown.
+/// The result of a check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Verdict {
-    /// Nothing yet: look again.
+    /// Not decided yet: check again.
     Undecided,
-    /// The holder has said something since the look before.
+    /// The holder has written since the last check.
     Spoke,
-    /// It has said nothing for long enough, and would have been able to.
+    /// The holder has been silent for long enough, although it could have written.
     Over,
-    /// It has said nothing for long enough, and there may have been no space to say it: only what is written now shows that there is, and
-    /// silence begins with it.
+    /// The holder has been silent for long enough, but etcd may have had no space for it to write. Only a new write shows that there is
+    /// space; silence begins with that write.
     Unwritable,
 }
 
-/// One more look at what a holder has written.
+/// One more check of what a holder has written.
 pub(super) fn look(silence: &mut Option<Silence>, signs: Signs, now: Instant) -> Verdict {
     let before = silence.filter(|before| now.saturating_duration_since(before.looked) <= LONGEST_PAUSE);
     let counted = match before {
@@ -69,7 +69,7 @@ mod tests {
 
     const SIGNS: Signs = Signs { leader: 5, alive: 9, writable: 5 };
 
-    /// The verdicts of looks of which each comes so many milliseconds after the one before.
+    /// The verdicts of checks; each is given with its delay after the previous one, in milliseconds.
     fn looks(looks: &[(u64, Signs)]) -> Vec<Verdict> {
         let (mut silence, mut now) = (None, Instant::now());
         let each = |(pause, signs): &(u64, Signs)| {
@@ -82,7 +82,7 @@ mod tests {
     #[test]
     fn the_place_is_free_after_a_silence_however_slow_the_answers_are() {
         use Verdict::{Over, Undecided};
-        // Every 50 ms: the first look, and 20 that are not enough.
+        // Every 50 ms: the first check, and 20 that are not enough.
         let quick = looks(&[(50, SIGNS); 23]);
         assert!(quick[..21].iter().all(|verdict| *verdict == Undecided) && quick[21] == Over, "{quick:?}");
         // Answers take 0.55 or 0.95 s.
@@ -90,7 +90,7 @@ mod tests {
             let slow = looks(&[(pause, SIGNS); 4]);
             assert_eq!(slow, [Undecided, Undecided, Undecided, Over], "{pause}");
         }
-        // etcd was away in between: who could not speak gets its time.
+        // etcd was away in between: a holder that could not write gets its time.
         let away = looks(&[(0, SIGNS), (900, SIGNS), (1_100, SIGNS), (900, SIGNS), (900, SIGNS), (900, SIGNS)]);
         assert_eq!(away, [Undecided, Undecided, Undecided, Undecided, Undecided, Over]);
     }
@@ -109,7 +109,7 @@ mod tests {
         let full = Signs { writable: 0, ..SIGNS };
         let seen = looks(&[(0, full), (500, full), (500, full), (50, full), (50, full), (50, SIGNS), (500, SIGNS)]);
         assert_eq!(seen[2..5], [Verdict::Undecided, Verdict::Unwritable, Verdict::Unwritable]);
-        // Somebody has written: only now it counts.
+        // A write by the standby: silence counts only from here.
         assert_eq!(seen[5..], [Verdict::Spoke, Verdict::Undecided]);
     }
 }

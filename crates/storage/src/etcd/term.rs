@@ -1,22 +1,23 @@
-//! The writer's place: who has it, how it is taken, kept and given up.
+//! The writer's place: its holder, and how it is taken, kept and given up.
 //!
 //! ```text
 //!   vacant ──take──▶ held: `alive` is written every 250 ms ──give up──▶ vacant
 //!                      │ `alive` was not written for a second
 //!                      └──take──▶ held by another: every write of the first is refused from now on
 //! ```
-//! Safety is in the guards, not in time: every write compares the revision of `leader`, which whoever takes the place changes. Time only
-//! decides when somebody else may take it. Who takes it compares `alive`, too: so the last confirmation of its predecessor was asked for
-//! before the silence began.
+//! Safety comes from the guards, not from time: every write compares the revision of `leader`, which changes whenever the place is taken.
+//! Time only decides when another process may take it. The process that takes it compares `alive`, too: so the last confirmation of its
+//! predecessor was requested before the silence began.
 //!
-//! A holder that hears no answers may say nothing, so it must not keep the place either: it writes `alive` once, to two members at the most,
-//! and from then on only looks, until a look is answered.
+//! A holder that gets no answers may not acknowledge anything, so it must not keep the place either: it writes `alive` once, to at most two
+//! members, and from then on only reads, until a read is answered.
 //!
-//! Nor must a holder keep the place whose owner takes no turns (`owner.rs`): it only looks, and confirms nothing, until the owner takes one.
+//! A holder whose owner takes no turns must not keep the place either (`owner.rs`): it only reads, and confirms nothing, until the owner
+//! takes a turn.
 //!
-//! While etcd has no space `alive` cannot be written, and nobody can take the place. The holder confirms itself by taking `writable` away,
-//! which needs no space. Who wants the place compares `writable` as well, and writes it where it is not there: silence begins with that, for
-//! the last confirmation may be as young.
+//! While etcd has no space, `alive` cannot be written, and no process can take the place. The holder confirms itself by deleting
+//! `writable`, which needs no space. A process that wants the place compares `writable` as well, and writes it if it does not exist:
+//! silence begins with that write, because the last confirmation may be just as recent.
 
 use super::client::{CallError, Client, Patience, cluster_of};
 use super::format::{Current, Head, Holder, Leader, Meta, VERSION, parse, text};
@@ -32,44 +33,44 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-/// Who has the place writes `alive` so often.
+/// Interval at which the holder writes `alive`.
 pub(super) const RENEW_INTERVAL: Duration = Duration::from_millis(250);
-/// How often somebody looks who wants the place.
+/// Interval of checks by a process that wants the place.
 const LOOK_INTERVAL: Duration = Duration::from_millis(50);
-/// A renewal is asked of so many members: one more would arrive when the first has been without an answer for too long.
+/// Number of members asked for a renewal: a third one would get the request when the first has been without an answer for too long.
 const RENEWAL_ASKS: usize = 2;
-/// A small transaction that takes longer comes too late.
+/// Time limit for a small transaction.
 pub(super) const PATIENCE: Duration = Duration::from_millis(900);
-/// Where only another cluster answers for so long, the one of before is not waited for any more.
+/// If only another cluster answers for this long, the original cluster is given up.
 pub(super) const OTHERS_PATIENCE: Duration = Duration::from_secs(5);
-/// After so long without an answer of any member there is no etcd.
+/// Without an answer of any member for this long, etcd counts as unreachable.
 const REACH: Duration = Duration::from_secs(5);
 
-/// What `unfinished` says until all of a copy is there.
+/// The value of `unfinished` until a copy is complete.
 pub(super) const PART_OF_A_COPY: &str = "a copy is being made";
 
-/// Everything small, as it was at one moment.
+/// All small keys, as they were at one revision.
 #[derive(Debug)]
 pub(super) struct Seen {
     pub(super) meta: Option<Meta>,
     pub(super) leader: Option<(i64, Leader)>,
     pub(super) head: Option<(i64, Head)>,
-    /// When `step` was written.
+    /// The revision at which `step` was written.
     pub(super) step: i64,
-    /// What the snapshot that counts stands for.
+    /// The position of the snapshot that counts.
     pub(super) through: Option<u64>,
-    /// It is a part of a copy: when that was said, and what.
+    /// The log is part of a copy: the revision at which that was marked, and the mark's text.
     pub(super) unfinished: Option<(i64, String)>,
-    /// It was moved, where to.
+    /// The log was moved to this place.
     moved: Option<String>,
     signs: Signs,
-    /// etcd's number of its cluster.
+    /// etcd's cluster id.
     pub(super) cluster: u64,
     /// etcd's revision.
     pub(super) revision: i64,
 }
 
-/// The place, held.
+/// The place, while it is held.
 #[derive(Debug)]
 pub(super) struct Term {
     pub(super) client: Arc<Client>,
@@ -77,7 +78,7 @@ pub(super) struct Term {
     pub(super) epoch: Epoch,
     pub(super) store: u64,
     pub(super) generation: u64,
-    /// Behind which record an older state was accepted.
+    /// The record after which an older state was accepted.
     pub(super) accepted: Option<u64>,
     /// The revision of `leader`: every write compares it.
     leader: i64,
@@ -87,7 +88,7 @@ pub(super) struct Term {
     unheard: AtomicBool,
     /// `writable` was taken away: etcd has no space.
     unwritable: AtomicBool,
-    /// Whom the writer belongs to takes no turns.
+    /// The writer's owner takes no turns.
     owner_hangs: AtomicBool,
 }
 
@@ -132,7 +133,7 @@ impl Seen {
         Ok(Seen { meta, leader, head, step, signs, through, unfinished, moved, cluster, revision })
     }
 
-    /// Refuses a part of a copy, and what was moved.
+    /// Refuses an unfinished copy, and a log that was moved.
     pub(super) fn whole(self, keys: &Keys) -> Result<Seen, ReadError> {
         let prefix = keys.prefix();
         let place = format!("{prefix} in etcd");
@@ -149,7 +150,7 @@ impl Seen {
         }
     }
 
-    /// Whether an older state was put in place of what there was, as far as can be seen.
+    /// Whether an older state was restored, as far as this host can see.
     pub(super) fn is_restored(&self, mark: &Mark) -> bool {
         mark.is_above(Height::of(self)) || self.meta.as_ref().is_some_and(|meta| meta.cluster != self.cluster)
     }
@@ -163,19 +164,19 @@ impl Seen {
         self.leader.as_ref().and_then(|(_, leader)| leader.holder.as_ref())
     }
 
-    /// Holds as long as nobody has said anything since.
+    /// A condition: no holder has written anything since.
     fn unchanged(&self, keys: &Keys) -> Vec<Compare> {
         let Signs { leader, alive, writable } = self.signs;
         vec![written_at(keys.leader(), leader), written_at(keys.alive(), alive), written_at(keys.writable(), writable)]
     }
 }
 
-/// Holds as long as it is neither a part of a copy nor moved.
+/// A condition: the log is neither an unfinished copy nor moved.
 fn unmarked(keys: &Keys) -> Vec<Compare> {
     vec![written_at(keys.unfinished(), 0), written_at(keys.moved(), 0)]
 }
 
-/// The generation of a copy that is made now: the seconds since 1970. Generations that begin otherwise are counted on.
+/// The generation of a copy that is made now: the seconds since 1970. Other generations continue from the one before.
 fn copied_now() -> u64 {
     #[expect(
         clippy::disallowed_methods,
@@ -192,7 +193,7 @@ fn with_revision<T: serde::de::DeserializeOwned>(
     kv.map(|kv| parse(key, &kv.value).map(|value| (kv.mod_revision, value))).transpose()
 }
 
-/// Looks until the place can be taken, or somebody who has it says something: then `held` is told of it.
+/// Checks until the place can be taken, or its holder writes something: then `held` is called.
 pub(super) fn await_vacancy(
     client: &Client,
     keys: &Keys,
@@ -218,7 +219,7 @@ pub(super) fn await_vacancy(
             Verdict::Unwritable => {
                 let success = vec![put(keys.writable(), text(&seen.signs.leader))];
                 let request = TxnRequest { compare: seen.unchanged(keys), success, failure: Vec::new() };
-                // Whether it is there, the next look shows.
+                // The next check shows whether it exists.
                 if let Err(error) = client.attempt(request, PATIENCE) {
                     return Err(unreadable(client, &error).into());
                 }
@@ -229,9 +230,8 @@ pub(super) fn await_vacancy(
     }
 }
 
-/// Takes the place, if nobody has taken it or said something since it was looked at, and it is still a whole log that was not moved: from then
-/// on only whoever has taken it can mark it as such. `accepts`: the generation that begins, where an older
-/// state is accepted.
+/// Takes the place, if no process has taken it or written anything since the check, and if the log is still complete and not moved: from
+/// then on only the new holder can mark it so. `accepts`: the generation that begins if an older state is accepted.
 pub(super) fn take(
     client: &Arc<Client>,
     keys: &Keys,
@@ -263,7 +263,7 @@ pub(super) fn take(
     ];
     let compare = [seen.unchanged(keys), unmarked(keys)].concat();
     let request = TxnRequest { compare, success, failure: vec![get(keys.leader())] };
-    // Repeated it finds what it wrote itself.
+    // A repetition finds what the transaction itself wrote.
     let answer = client.repeat(&request, PATIENCE, Instant::now() + REACH);
     let answer = answer.map_err(|error| OpenError::Read(unreadable(client, &error)))?;
     let revision = match answer.succeeded {
@@ -298,7 +298,7 @@ pub(super) fn take(
 }
 
 impl Term {
-    /// Held since a revision, for tests of what it guards.
+    /// Held since a revision, for tests of guarded transactions.
     #[cfg(test)]
     pub(super) fn since(client: Arc<Client>, keys: Keys, leader: i64) -> Term {
         let [lost, unheard, unwritable, owner_hangs] = [(); 4].map(|()| AtomicBool::new(false));
@@ -306,25 +306,25 @@ impl Term {
         Term { client, keys, epoch, store, generation, accepted, leader, draw, lost, unheard, unwritable, owner_hangs }
     }
 
-    /// What is said of a log that becomes a copy. Its generation is above that of every state which was here or anywhere else before, so that
-    /// hosts which have seen one of those accept the copy, and none of those in place of the copy.
+    /// The metadata of a log that becomes a copy. Its generation is above those of all earlier states, here or elsewhere: so a host that
+    /// has seen one of those accepts the copy, and accepts none of those in place of the copy.
     pub(super) fn meta_of_a_copy(&self) -> Meta {
         let generation = self.generation.max(copied_now());
         let cluster = self.client.cluster().unwrap_or_default();
         Meta { version: VERSION, store: self.store, cluster, generation, accepted: None }
     }
 
-    /// Holds as long as the place is held.
+    /// A condition: the place is still held.
     pub(super) fn guard(&self) -> Compare {
         written_at(self.keys.leader(), self.leader)
     }
 
-    /// Only performed while the place is held.
+    /// A transaction that is performed only while the place is held.
     pub(super) fn guarded(&self, success: Vec<RequestOp>) -> TxnRequest {
         TxnRequest { compare: vec![self.guard()], success, failure: Vec::new() }
     }
 
-    /// Whether `leader`, written at this revision, says that the place is held.
+    /// Whether `leader`, written at this revision, means that the place is still held.
     pub(super) fn is_since(&self, leader: i64) -> bool {
         leader == self.leader
     }
@@ -334,7 +334,7 @@ impl Term {
         Fault::Deposed { place: self.keys.prefix().to_owned() }
     }
 
-    /// That the place is held, said to everybody, and confirmed.
+    /// Renews the place, visible to all, and confirms that it is held.
     pub(super) fn renew(&self) -> Result<(), Fault> {
         if self.lost.load(Ordering::SeqCst) {
             return Err(self.deposed());
@@ -347,7 +347,7 @@ impl Term {
             let what = format!("its process has taken no turn for {} s", LONGEST_TURN.as_secs());
             return Err(Fault::Remote { action: "keep", place: self.keys.prefix().to_owned(), what });
         }
-        // Given up meanwhile.
+        // The place was given up meanwhile.
         if self.lost.load(Ordering::SeqCst) {
             return Err(self.deposed());
         }
@@ -358,7 +358,7 @@ impl Term {
         }
         let patience = Patience { answer: PATIENCE, asks: RENEWAL_ASKS };
         let renewed = match self.client.attempt(self.guarded(alive), patience) {
-            // It cannot be said, but whoever wants the place can be kept from taking it.
+            // `alive` cannot be written, but others can be kept from taking the place.
             Err(CallError::NoSpace) => {
                 self.unwritable.store(true, Ordering::SeqCst);
                 self.held(self.client.attempt(self.guarded(vec![delete(self.keys.writable())]), PATIENCE))
@@ -374,13 +374,13 @@ impl Term {
         renewed
     }
 
-    /// Why the place will not be held again, whoever has it: etcd went back, or only another cluster has answered for long.
+    /// Why the place will never be held again: etcd's revision decreased, or only another cluster has answered for long.
     pub(super) fn is_gone(&self) -> Option<Fault> {
         let error = self.client.went_back().or_else(|| self.client.only_others_for(OTHERS_PATIENCE))?;
         Some(self.fault("keep", &error))
     }
 
-    /// Whether whom the writer belongs to hangs. While it does, nothing is confirmed, and the place is not kept.
+    /// Sets whether the writer's owner hangs. While it does, the place is neither confirmed nor kept.
     pub(super) fn owner_hangs(&self, hangs: bool) {
         if self.owner_hangs.swap(hangs, Ordering::SeqCst) != hangs {
             let place = self.keys.prefix();
@@ -391,12 +391,12 @@ impl Term {
         }
     }
 
-    /// Whether the place is still held. It does not keep it.
+    /// Checks whether the place is still held, without renewing it.
     fn look(&self) -> Result<(), Fault> {
         self.held(self.client.attempt(self.guarded(vec![get(self.keys.leader())]), PATIENCE))
     }
 
-    /// What the answer to something guarded says.
+    /// Interprets the answer to a guarded transaction.
     fn held(&self, answer: Result<TxnResponse, CallError>) -> Result<(), Fault> {
         match answer {
             Ok(answer) if answer.succeeded => Ok(()),
@@ -405,7 +405,7 @@ impl Term {
         }
     }
 
-    /// The place is free for the next one at once. Whether that was heard is not known where etcd does not answer.
+    /// Gives the place up, so that the next process can take it at once. If etcd does not answer, it is unknown whether this had an effect.
     pub(super) fn give_up(&self) {
         let vacant = Leader { epoch: self.epoch.0, holder: None, draw: self.draw };
         let request = self.guarded(vec![put(self.keys.leader(), text(&vacant)), delete(self.keys.alive())]);
@@ -418,7 +418,7 @@ impl Term {
     }
 }
 
-/// The place, for those who ask beside the writer.
+/// The place, for checks independent of the writer.
 #[derive(Debug, Clone)]
 pub(super) struct HeldPlace(pub(super) Arc<Term>);
 

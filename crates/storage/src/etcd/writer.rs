@@ -4,8 +4,8 @@
 //!   append ──▶ batch ──take──▶ frame: { leader and head as I know them? put frame, move head } ──▶ durable
 //!                                └── no answer: the same again; `head` says whether it was performed
 //! ```
-//! While etcd does not answer or has no space, what is appended waits, and [`Progress::stalled`](crate::Progress) says why. What waits is
-//! bounded: then appends are refused, and accepted again when etcd is back.
+//! While etcd does not answer or has no space, appended records wait, and [`Progress::stalled`](crate::Progress) says why. The waiting
+//! bytes are bounded: beyond the limit appends are refused, until etcd is back.
 
 use super::chain::Chain;
 use super::client::{CallError, Client, FIRST_PAUSE, LONGEST_PAUSE};
@@ -28,29 +28,29 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError, mpsc};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-/// A transaction with a whole part is asked for again after so long.
+/// Time limit for a transaction with a whole part; then it is repeated.
 pub(super) const PATIENCE: Duration = Duration::from_secs(10);
-/// A transaction that is not performed for so long is told of.
+/// A transaction that takes longer than this is reported as stalled.
 const STALLED_AFTER: Duration = Duration::from_millis(500);
-/// Where several wait for a transaction, the next one waits for them this part of its time …
+/// If several callers waited for a transaction, the next one is delayed for them by this part of its duration …
 const LINGER_SHARE: u32 = 8;
-/// … and no longer than this.
+/// … and by no more than this.
 const LONGEST_LINGER: Duration = Duration::from_millis(2);
-/// Who closes waits so long for an etcd that does not answer.
+/// How long closing waits for an etcd that does not answer.
 const CLOSE_PATIENCE: Duration = Duration::from_secs(3);
-/// What etcd refuses is asked for again for so long: some refusals pass.
+/// How long a refused call is retried: some refusals are temporary.
 const REFUSED_PATIENCE: Duration = Duration::from_secs(5);
-/// Where etcd has no space it is asked again after so long.
+/// Pause before a retry if etcd has no space.
 const NO_SPACE_PAUSE: Duration = Duration::from_millis(500);
 
-/// The bounds of a log in etcd, in bytes.
+/// The size limits of a log in etcd, in bytes.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Bounds {
-    /// The largest record.
+    /// Maximum size of a record.
     pub record: usize,
-    /// What may wait to be written. As much again may be being written.
+    /// Maximum bytes that wait to be written. As many again may be in writing.
     pub buffered: usize,
-    /// What one transaction puts: below etcd's `--max-request-bytes` of 1.5 MiB.
+    /// Maximum size of what one transaction puts: below etcd's `--max-request-bytes` of 1.5 MiB.
     pub part: usize,
 }
 
@@ -66,9 +66,9 @@ pub(super) struct Shared {
     pub(super) term: Arc<Term>,
     pub(super) pending: Pending,
     pub(super) bounds: Bounds,
-    /// (first, last) of every frame that is there.
+    /// (first, last) record of every existing frame.
     frames: Mutex<VecDeque<(Position, Position)>>,
-    /// Of everything but frames.
+    /// The chain for everything but frames, and its step count.
     snapshots: Mutex<(Chain, u64)>,
     closing_since: Mutex<Option<Instant>>,
 }
@@ -95,7 +95,7 @@ impl Shared {
         Shared { term, pending, bounds, frames, snapshots, closing_since: Mutex::default() }
     }
 
-    /// Changes a snapshot, what one replaces, or what is said of the whole log. Nobody waits for that who closes the log.
+    /// Changes a snapshot, what it replaces, or the marks of the log. Closing the log does not wait for this.
     pub(super) fn change_snapshots(&self, operations: Vec<RequestOp>) -> Result<(), Fault> {
         if self.pending.is_closing() {
             return Err(Fault::Closed);
@@ -107,7 +107,8 @@ impl Shared {
         chain.step(&self.term, operations, value, |request| self.perform(request))
     }
 
-    /// Whether the snapshot that counts is the one through this position. What was given up before is not performed after this any more.
+    /// Whether the snapshot through this position is the one that counts. After this call, earlier steps that were given up are not
+    /// performed any more.
     pub(super) fn counts(&self, through: Position) -> Result<bool, Fault> {
         self.change_snapshots(Vec::new())?;
         let keys = &self.term.keys;
@@ -124,7 +125,7 @@ impl Shared {
         Ok(current.through == through.0)
     }
 
-    /// Forgets the frames that hold nothing after this position; from which to which they begin.
+    /// Forgets the frames that hold nothing after this position; returns the range of their first records.
     pub(super) fn superfluous(&self, through: Position) -> Option<(Position, Position)> {
         let mut frames = self.frames.lock().unwrap_or_else(PoisonError::into_inner);
         let (first, _) = *frames.front()?;
@@ -135,7 +136,7 @@ impl Shared {
         (end > first).then_some((first, end))
     }
 
-    /// Performs what has no effect twice, until it is performed or never will be.
+    /// Performs an idempotent transaction, until it is performed or never will be.
     pub(super) fn perform(&self, request: &TxnRequest) -> Result<super::wire::TxnResponse, Fault> {
         let (client, began): (&Client, _) = (&self.term.client, Instant::now());
         let mut pause = FIRST_PAUSE;
@@ -152,7 +153,7 @@ impl Shared {
             if let Some(fault) = self.pending.fault() {
                 return Err(fault);
             }
-            // A member of the cluster of before may run on, and hold what it is asked for.
+            // A member of the original cluster may still run, and hold the request without an answer.
             let error = match error {
                 CallError::Unknown(_) => client.only_others_for(OTHERS_PATIENCE).unwrap_or(error),
                 error => error,
@@ -187,16 +188,16 @@ impl Shared {
     }
 }
 
-/// The thread that writes.
+/// The writing thread.
 struct Writing {
     shared: Arc<Shared>,
     chain: Chain,
-    /// The last record that counts, and how often `head` was written in this epoch.
+    /// The head's position, and how often `head` was written in this epoch.
     head: Position,
     step: u64,
 }
 
-/// Says that nobody writes any more, however the thread ended.
+/// Reports that no thread writes any more, in whatever way the thread ended.
 pub(super) struct Ended(pub(super) Arc<Shared>);
 
 impl Drop for Ended {
@@ -219,15 +220,15 @@ impl Writing {
                 shared.pending.stop(&fault);
                 return;
             }
-            // Those who were waiting for this batch are about to append again: without a moment for them the next transaction would be for
-            // the first of them alone, and all others wait for two. Who is alone waits for nobody.
+            // The callers of this batch are about to append again: without a short delay the next transaction would serve only the first of
+            // them, and all others would wait for two. A single caller causes no delay.
             linger =
                 if batch.count > 1 { (began.elapsed() / LINGER_SHARE).min(LONGEST_LINGER) } else { Duration::ZERO };
             shared.pending.give_back(batch);
         }
     }
 
-    /// As few frames as hold it; a record that is larger than a transaction has one of its own.
+    /// Writes a batch in as few frames as possible; a record that is larger than a transaction gets a frame of its own.
     fn write(&mut self, batch: &Batch) -> Result<(), Fault> {
         let most = self.shared.bounds.part - super::format::FRAME_HEADER;
         let mut rest = &batch.bytes[..];
@@ -250,7 +251,7 @@ impl Writing {
         Ok(())
     }
 
-    /// With a head that says so.
+    /// Puts a part, together with the new head.
     fn put(&mut self, part: RequestOp, head: Position) -> Result<(), Fault> {
         self.step += 1;
         self.head = head;
@@ -267,7 +268,7 @@ impl Writing {
         let mut puts: Vec<RequestOp> =
             (0..).zip(parts).map(|(number, part)| put(keys.frame(first, number), part)).collect();
         let begin = puts.remove(0);
-        // What is behind the head does not count until the head has moved.
+        // Parts after the head do not count until the head has moved.
         for part in puts {
             self.put(part, self.head)?;
         }
@@ -277,16 +278,16 @@ impl Writing {
     }
 }
 
-/// Says that the place is held, from the moment it was taken: reading a long log may take longer than a silence. Gives the place up in
+/// Renews the place from the moment it was taken, because reading a long log may take longer than the silence limit. Gives the place up at
 /// the end.
 pub(super) struct Renewing {
     term: Arc<Term>,
-    /// Who hears that the place is lost, once there is a writer.
+    /// The writer, once there is one: it is stopped if the place is lost.
     writer: Arc<OnceLock<Arc<Shared>>>,
     panicked: Arc<AtomicBool>,
-    /// How many turns the owner has taken, where it says so.
+    /// The number of turns the owner has taken, if the owner reports it.
     turns: Arc<OnceLock<Turns>>,
-    /// Ends the thread; nothing after the end.
+    /// Ends the thread; `None` after the end.
     thread: Option<(mpsc::Sender<()>, JoinHandle<()>)>,
 }
 
@@ -310,7 +311,7 @@ impl Renewing {
                     Ok(()) => None,
                 };
                 keep(&kept, &tell);
-                // One that is found lost before there is a writer is found lost again.
+                // If the loss is found before there is a writer, it will be found again.
                 if let (Some(fault), Some(writer)) = (over, tell.get()) {
                     writer.pending.stop(&fault);
                     return;
@@ -332,15 +333,15 @@ impl Renewing {
     fn end(&mut self) {
         if let Some((end, thread)) = self.thread.take() {
             drop(end);
-            // Whatever the thread is still asking: it is refused from now on.
+            // Whatever the thread is still asking: it will be refused from now on.
             self.term.give_up();
             let _ = thread.join();
         }
     }
 }
 
-/// Says that nobody renews the place any more, where the thread that does ended by a panic. What is written without that is refused soon,
-/// but the process would stand there until it hears so.
+/// Reports that the place is not renewed any more, if the renewing thread panicked. Writes are then refused soon, but until then the
+/// process would not know.
 struct Unrenewed {
     writer: Arc<OnceLock<Arc<Shared>>>,
     panicked: Arc<AtomicBool>,
@@ -349,7 +350,7 @@ struct Unrenewed {
 impl Drop for Unrenewed {
     fn drop(&mut self) {
         if thread::panicking() {
-            // A writer that comes later looks at this.
+            // A writer that comes later checks this.
             self.panicked.store(true, Ordering::SeqCst);
             self.writer.get().into_iter().for_each(stop_ended);
         }
@@ -360,7 +361,7 @@ fn stop_ended(shared: &Arc<Shared>) {
     shared.pending.stop(&Fault::Ended { place: shared.pending.place.clone() });
 }
 
-/// What has become durable, for this host to know later.
+/// Records for this host how far the log is durable.
 fn keep(mark: &Mark, writer: &OnceLock<Arc<Shared>>) {
     if let Some(writer) = writer.get() {
         let position = writer.pending.watch().borrow().durable.0;
@@ -387,17 +388,17 @@ impl Drop for Renewing {
 impl EtcdWriter {
     pub(super) fn start(shared: Arc<Shared>, chain: Chain, renewing: Renewing) -> io::Result<EtcdWriter> {
         let head = shared.pending.appended();
-        // The first step cleared what is behind the head.
+        // The first step removed what is after the head.
         let writing = Writing { shared: shared.clone(), chain, head, step: 1 };
         let writing = thread::Builder::new().name("etcd-writer".to_owned()).spawn(move || writing.run())?;
         renewing.watched_by(&shared);
         Ok(EtcdWriter { shared, writing: Some(writing), compaction: None, renewing })
     }
 
-    /// Writes what waits, gives up the place, and ends every thread. A compaction is given up: the next writer makes another one.
+    /// Writes what waits, gives up the place, and ends every thread. A compaction is abandoned: the next writer makes another one.
     fn end(&mut self) {
         self.shared.close();
-        // A panic of these has stopped the log already, with a fault.
+        // A panic of a thread has stopped the log already, with a fault.
         let _ = self.writing.take().map(JoinHandle::join);
         self.renewing.end();
         let _ = self.compaction.take().map(JoinHandle::join);
@@ -421,7 +422,7 @@ impl Writer for EtcdWriter {
     fn compact(&mut self, through: Position, snapshot: MakeSnapshot) -> Result<(), CompactError> {
         self.shared.pending.begin_compaction(through)?;
         if let Some(ended) = self.compaction.take() {
-            // It has said that it ended, so this waits for no more than its last instructions.
+            // The thread has reported its end, so this waits only for its last instructions.
             let _ = ended.join();
         }
         let compaction = Compaction { shared: self.shared.clone(), through };

@@ -1,7 +1,7 @@
-//! A consistent copy of a log, made while it is written; and a log from such a copy.
+//! Makes a consistent copy of a log while the log is written, and restores a log from such a copy.
 //!
-//! What is copied is read and checked as a recovery reads it. The copy is made under another name beside the target, read again, and
-//! only then gets the target's name: there is a whole backup, or none.
+//! The source is read and checked as in a recovery. The copy is made under a temporary name beside the target, read again, and only then
+//! renamed to the target: there is a complete backup, or none.
 
 use super::contents::{self, Contents};
 use super::files::{Disk, Files};
@@ -13,34 +13,34 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::{fs, io};
 
-/// What a copy holds.
+/// The positions that a copy covers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Copied {
     /// The last record.
     pub through: Position,
-    /// The snapshot stands for records through this one; 0 where there is none.
+    /// The snapshot replaces records through this one; 0 without a snapshot.
     pub snapshot: Position,
 }
 
-/// Copies a log into a directory that is empty or not there yet. Contains at least what was durable when it began. Holds the
+/// Copies a log into a directory that is empty or does not exist. The copy contains at least what was durable when it began. Holds the
 /// whole log in memory. Blocks.
 ///
 /// # Errors
-/// Where there is no log, where it is damaged, where the target has something in it, or where the system refuses.
+/// There is no log, it is damaged, the target is not empty, or the system refuses.
 pub fn backup(log: &Path, target: &Path) -> Result<Copied, CopyError> {
     copy(&Disk, log, target)
 }
 
-/// Makes a log of a backup, in a directory that is empty or not there yet: a log that exists is never overwritten. Its epochs
-/// go on from the backup's, so a writer of the log that is replaced has to be ended first. Blocks.
+/// Makes a log from a backup, in a directory that is empty or does not exist: an existing log is never overwritten. Its epochs continue
+/// from the backup's, so a writer of the replaced log has to be ended first. Blocks.
 ///
 /// # Errors
-/// As of [`backup`].
+/// As for [`backup`].
 pub fn restore(backup: &Path, target: &Path) -> Result<Copied, CopyError> {
     copy(&Disk, backup, target)
 }
 
-/// The same on another disk.
+/// Copies with these file operations.
 pub(super) fn copy(files: &dyn Files, source: &Path, target: &Path) -> Result<Copied, CopyError> {
     let contents = contents::read(source)?;
     if contents.store.is_none() {
@@ -88,7 +88,7 @@ fn refuse_what_is_not_empty(target: &Path) -> Result<(), CopyError> {
     }
 }
 
-/// A name beside the target's.
+/// A temporary name beside the target's.
 fn unfinished(target: &Path) -> Result<PathBuf, CopyError> {
     let name = target.file_name().ok_or_else(|| CopyError::NotEmpty { place: target.display().to_string() })?;
     let mut unfinished = OsString::from(".");

@@ -1,7 +1,7 @@
-//! Replaces records by a snapshot, in a thread of its own: snapshot onto the disk, then the segments it stands for away.
+//! Replaces records by a snapshot, in a thread of its own: writes the snapshot, then removes the segments that it replaces.
 //!
-//! A crash between the two leaves segments that nobody reads; the next compaction or the next writer removes them. A snapshot that
-//! cannot be written is thrown away, and the log goes on: nothing that was acknowledged depends on it.
+//! A crash between the two leaves segments that are not read any more; the next compaction or the next writer removes them. A snapshot that
+//! cannot be written is discarded, and the log goes on: no acknowledged record depends on it.
 
 use super::files::Files;
 use super::format::StoreId;
@@ -22,7 +22,7 @@ pub(super) struct Compaction {
     pub(super) through: Position,
 }
 
-/// Says that it has ended, however it did.
+/// Reports the end of the compaction, whatever caused it.
 struct Ended<'a>(&'a Shared, Option<Result<Position, Option<CompactionFailure>>>);
 
 impl Drop for Ended<'_> {
@@ -39,7 +39,7 @@ impl Compaction {
         let mut ended = Ended(&self.shared, None);
         ratn_panic_point::panic_point("log-compaction");
         let payload = make();
-        // The snapshot must not know of records that a crash could still take away.
+        // The snapshot must not contain records that a crash could still take away.
         if Durable::new(self.shared.pending.watch()).wait_blocking(self.through).is_err() {
             return;
         }

@@ -1,6 +1,6 @@
 //! Reads a log's directory: the latest snapshot, and the segments with records after it.
 //!
-//! Segments whose records are all in the snapshot are not looked into: a compaction that was stopped may have left them.
+//! Segments whose records are all in the snapshot are not read: an interrupted compaction may have left them.
 
 use super::directory::{self, Listing};
 use super::format::{SEGMENT_HEADER, StoreId};
@@ -13,17 +13,17 @@ use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::Path;
 
-/// A reader beside a writer may find that a compaction has removed what it was about to read. Then it looks again.
+/// Number of attempts to read. A compaction by the writer may remove a file that is about to be read; then reading starts again.
 const LOOKS: usize = 8;
 
-/// What was read.
+/// The contents of a log's directory.
 #[derive(Debug, Default)]
 pub(super) struct Contents {
     pub(super) listing: Listing,
-    /// Nothing where there is no log yet.
+    /// `None` if there is no log yet.
     pub(super) store: Option<StoreId>,
     pub(super) snapshot: Option<Snapshot>,
-    /// Without those that the snapshot makes superfluous.
+    /// Without the segments that the snapshot replaces.
     pub(super) segments: Vec<Segment>,
 }
 
@@ -55,7 +55,7 @@ impl Contents {
     }
 }
 
-/// Reads what is there, whoever writes it meanwhile.
+/// Reads the log, also while a writer writes it.
 pub(super) fn read(directory: &Path) -> Result<Contents, ReadError> {
     for _ in 1..LOOKS {
         match read_once(directory) {
@@ -76,7 +76,7 @@ fn read_once(directory: &Path) -> Result<Contents, ReadError> {
     let unfinished = directory.join(directory::UNFINISHED_COPY);
     if unfinished.exists() {
         let place = directory.display().to_string();
-        // A copy of which all is there says more than that.
+        // The mark of a complete copy is not empty.
         let complete = std::fs::metadata(&unfinished).is_ok_and(|mark| mark.len() > 0);
         return Err(ReadError::Unfinished { complete, how: format!("rm -r {place}"), place });
     }
@@ -112,9 +112,9 @@ fn read_once(directory: &Path) -> Result<Contents, ReadError> {
     Ok(contents)
 }
 
-/// The segments from the one on that holds the first record after the snapshot.
+/// The segments from the one with the first record after the snapshot on.
 fn needed<'a>(directory: &Path, listing: &'a Listing, through: Position) -> Result<&'a [u64], ReadError> {
-    // From the back, so that superfluous ones are not even opened, but for one.
+    // From the last one backwards, so that at most one superfluous segment is opened.
     let mut from = listing.segments.len();
     while from > 0 {
         from -= 1;
@@ -130,7 +130,7 @@ fn needed<'a>(directory: &Path, listing: &'a Listing, through: Position) -> Resu
     Ok(&listing.segments[from..])
 }
 
-/// A segment begins where what was read before it ends, and belongs to the same log.
+/// Checks that a segment begins where the previous contents end, and belongs to the same log.
 fn follows(place: &str, before: &Contents, segment: &Segment, number: u64) -> Result<(), ReadError> {
     let damaged = |what| Err(ReadError::Damaged { place: place.to_owned(), offset: 0, what });
     let header = &segment.header;

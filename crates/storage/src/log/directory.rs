@@ -1,12 +1,12 @@
 //! The names in a log's directory.
 //!
 //! ```text
-//!   writer.lock                         whose inode is locked by the writer
+//!   writer.lock                         locked by the writer
 //!   segment-00000000000000000001.log    by number
-//!   snapshot-00000000000000004711.snap  by the last position it stands for
-//!   unfinished-copy                     until a copy counts; says what the source's moved-to says, when all is there
-//!   moved-to                            says where all of it was moved to
-//!   *.tmp                               not finished; the next writer removes it
+//!   snapshot-00000000000000004711.snap  by the last position that it replaces
+//!   unfinished-copy                     exists until a copy counts; in a complete copy, the same text as moved-to in its source
+//!   moved-to                            the place to which the log was moved
+//!   *.tmp                               unfinished; the next writer removes it
 //! ```
 
 use crate::store::Position;
@@ -18,7 +18,7 @@ pub(super) const UNFINISHED_COPY: &str = "unfinished-copy";
 pub(super) const MOVED: &str = "moved-to";
 const TEMPORARY: &str = "tmp";
 
-/// What is there, in order.
+/// The files in the directory, in order.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Listing {
     pub(super) segments: Vec<u64>,
@@ -34,12 +34,12 @@ pub(super) fn snapshot(directory: &Path, through: Position) -> PathBuf {
     directory.join(format!("snapshot-{:020}.snap", through.0))
 }
 
-/// The name of a file that is not finished.
+/// The temporary name of an unfinished file.
 pub(super) fn temporary(path: &Path) -> PathBuf {
     path.with_extension(TEMPORARY)
 }
 
-/// Nothing where there is no such directory. Files of other names are not ours and are left alone.
+/// Empty if the directory does not exist. Files with other names do not belong to the log and are ignored.
 pub(super) fn list(directory: &Path) -> io::Result<Listing> {
     let mut listing = Listing::default();
     let entries = match fs::read_dir(directory) {

@@ -8,63 +8,63 @@ use std::path::Path;
 
 /// A file that is being written.
 pub trait LogFile: fmt::Debug + Send {
-    /// Puts bytes behind those that were written.
+    /// Appends bytes to those that were written.
     ///
     /// # Errors
-    /// What the system says.
+    /// The system's error.
     fn write(&mut self, bytes: &[u8]) -> io::Result<()>;
-    /// Puts so many zeros where the next bytes will go. A sync of bytes that come in the place of others has less to do than one of a
-    /// file that grew.
+    /// Writes this many zeros where the next bytes will go. Syncing bytes that overwrite others takes less time than syncing a file that
+    /// has grown.
     ///
     /// # Errors
-    /// What the system says.
+    /// The system's error.
     fn reserve(&mut self, bytes: usize) -> io::Result<()>;
-    /// Takes away what was reserved and not written.
+    /// Truncates what was reserved and not written.
     ///
     /// # Errors
-    /// What the system says.
+    /// The system's error.
     fn cut(&mut self) -> io::Result<()>;
-    /// Returns when what was written is on the disk.
+    /// Returns when all written bytes are on disk.
     ///
     /// # Errors
-    /// What the system says.
+    /// The system's error.
     fn sync(&mut self) -> io::Result<()>;
 }
 
-/// A disk: the file system of this machine, unless an implementation does something else.
+/// The file operations: those of this machine's file system, unless overridden.
 pub trait Files: fmt::Debug + Send + Sync {
-    /// An empty file; what was there is gone.
+    /// Creates an empty file, or truncates an existing one.
     ///
     /// # Errors
-    /// What the system says.
+    /// The system's error.
     fn create(&self, path: &Path) -> io::Result<Box<dyn LogFile>> {
         Ok(Box::new(OpenOptions::new().create(true).write(true).truncate(true).open(path)?))
     }
-    /// A directory in one that is there.
+    /// Creates a directory in an existing one.
     ///
     /// # Errors
-    /// What the system says, also that it is there already.
+    /// The system's error, also if it exists already.
     fn create_directory(&self, path: &Path) -> io::Result<()> {
         fs::create_dir(path)
     }
-    /// Another name for a file or a directory, in place of what had the name.
+    /// Renames a file or a directory; replaces an existing target.
     ///
     /// # Errors
-    /// What the system says.
+    /// The system's error.
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
         fs::rename(from, to)
     }
-    /// The file is gone.
+    /// Removes a file.
     ///
     /// # Errors
-    /// What the system says.
+    /// The system's error.
     fn remove(&self, path: &Path) -> io::Result<()> {
         fs::remove_file(path)
     }
-    /// Returns when the names in it are on the disk.
+    /// Returns when the names in the directory are on disk.
     ///
     /// # Errors
-    /// What the system says.
+    /// The system's error.
     fn sync_directory(&self, path: &Path) -> io::Result<()> {
         File::open(path)?.sync_all()
     }

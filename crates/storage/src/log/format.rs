@@ -1,4 +1,4 @@
-//! Version 1 of what is on the disk. Numbers are little-endian.
+//! Format version 1 of the files. Numbers are little-endian.
 //!
 //! ```text
 //!   segment   header 48: "ratn-log" | version u32 | store u64 | number u64 | first u64 | epoch u64 | crc32c u32
@@ -7,14 +7,14 @@
 //!   snapshot  header 44: "ratn-snp" | version u32 | store u64 | through u64 | length u64 | crc32c u32, of payload u32
 //!             payload
 //! ```
-//! A frame is what one write put there, and what one sync made durable: it is there as a whole, or not at all. Its checksum
-//! covers also the store, the segment and the offset, so that a frame is none anywhere else: not in a payload that holds a
-//! copy of a log, nor where a file's blocks belonged to another before.
+//! A frame is the content of one write, made durable by one sync: it is there as a whole, or not at all. Its checksum also covers the
+//! store, the segment and the offset, so that the same bytes are no valid frame anywhere else: not in a payload that contains a copy of a
+//! log, nor in a file whose blocks belonged to another file before.
 
 use crate::store::{Epoch, Position};
 use crc32c::{crc32c, crc32c_append};
 
-/// The version that is written. Older ones are read by what [`super::segment`] and [`super::snapshot`] dispatch to.
+/// The version that this program writes. [`super::segment`] and [`super::snapshot`] choose the reader for older ones.
 pub(super) const VERSION: u32 = 1;
 pub(super) const SEGMENT_MAGIC: [u8; 8] = *b"ratn-log";
 pub(super) const SNAPSHOT_MAGIC: [u8; 8] = *b"ratn-snp";
@@ -23,7 +23,7 @@ pub(super) const FRAME_HEADER: usize = 20;
 pub(super) const SNAPSHOT_HEADER: usize = 44;
 pub(super) use crate::pending::RECORD_HEADER;
 
-/// Which log this is: a number drawn when it was made, so that files of two logs are not taken for one.
+/// Identifies a log: a random number drawn when it was made, so that files of two logs are not mixed up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct StoreId(pub(super) u64);
 
@@ -34,7 +34,7 @@ pub(super) struct SegmentHeader {
     pub(super) number: u64,
     /// The position of its first record.
     pub(super) first: Position,
-    /// Of the writer that began it, or took it over.
+    /// The epoch of the writer that began the segment, or took it over.
     pub(super) epoch: Epoch,
 }
 
@@ -48,7 +48,7 @@ pub(super) struct SnapshotHeader {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct FrameHeader {
-    /// Of what follows the header.
+    /// Length of what follows the header, in bytes.
     pub(super) length: u32,
     pub(super) crc: u32,
     pub(super) first: Position,
@@ -69,7 +69,7 @@ impl SegmentHeader {
         bytes
     }
 
-    /// Nothing where the checksum is wrong.
+    /// `None` if the checksum is wrong.
     pub(super) fn decode(bytes: &[u8; SEGMENT_HEADER]) -> Option<SegmentHeader> {
         (crc32c(&bytes[..44]) == u32_at(bytes, 44)).then(|| SegmentHeader {
             store: StoreId(u64_at(bytes, 12)),
@@ -105,7 +105,7 @@ impl SnapshotHeader {
         bytes
     }
 
-    /// Nothing where the checksum is wrong.
+    /// `None` if the checksum is wrong.
     pub(super) fn decode(bytes: &[u8; SNAPSHOT_HEADER]) -> Option<SnapshotHeader> {
         (crc32c(&bytes[..40]) == u32_at(bytes, 40)).then(|| SnapshotHeader {
             store: StoreId(u64_at(bytes, 12)),
@@ -126,7 +126,7 @@ impl FrameHeader {
         bytes
     }
 
-    /// Nothing where there are not so many bytes.
+    /// `None` if there are too few bytes.
     pub(super) fn decode(bytes: &[u8]) -> Option<FrameHeader> {
         let bytes = bytes.first_chunk::<FRAME_HEADER>()?;
         Some(FrameHeader {
@@ -138,7 +138,7 @@ impl FrameHeader {
     }
 }
 
-/// The version that a file of ours says, after its magic; nothing where the magic is another's or the file is too short.
+/// The format version of a file, after its magic; `None` if the magic differs or the file is too short.
 pub(super) fn version(bytes: &[u8], magic: [u8; 8]) -> Option<u32> {
     (bytes.len() >= 12 && bytes[..8] == magic).then(|| u32_at(bytes, 8))
 }

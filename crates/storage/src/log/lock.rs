@@ -1,9 +1,9 @@
-//! One writer: an advisory lock on a file that is never removed.
+//! Ensures one writer: an advisory lock on a file that is never removed.
 //!
-//! A lock can be got past (the file is removed by hand, a copy of the directory is put in its place). The writer notices: before
-//! it acknowledges anything it looks whether the name still leads to the file that it holds. A process that took the place later did so
-//! before reading the log, so what was acknowledged before is read by them. The same look compares the segment that is written: one that
-//! was removed, or replaced by a copy, takes records that nobody will read.
+//! A lock can be circumvented (the file is removed by hand, or the directory is replaced by a copy). The writer notices: before each
+//! acknowledgement it checks whether the name still leads to the file that it holds. A process that took the place later did so before
+//! reading the log, so it reads what was acknowledged before. The same check covers the segment that is written: if it was removed, or
+//! replaced by a copy, nobody would read the records in it.
 
 use super::directory;
 use crate::error::{Fault, OpenError};
@@ -14,25 +14,25 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// At most so much of what a holder wrote about itself is read.
+/// Maximum number of bytes read of what a holder wrote about itself.
 const HOLDER_BYTES: u64 = 256;
 
 #[derive(Debug)]
 pub(super) struct Lock {
-    /// Holds the lock for as long as it is open.
+    /// The lock is held while this file is open.
     file: File,
     held: HeldPlace,
 }
 
-/// The name of the lock, and the file that it led to when it was taken; and the same of the segment that is written. Both files are
-/// open as long as the writer is there, so no other one has their inodes.
+/// The name of the lock and the file that it led to when it was taken; and the same for the segment that is written. Both files stay open
+/// as long as the writer lives, so no other file gets their inodes.
 #[derive(Debug, Clone)]
 pub(super) struct HeldPlace {
     lock: NamedFile,
     segment: Arc<Mutex<Option<NamedFile>>>,
 }
 
-/// A name, and device and inode of the file that it led to.
+/// A name, with device and inode of the file that it led to.
 #[derive(Debug, Clone)]
 struct NamedFile {
     path: PathBuf,
@@ -45,7 +45,7 @@ impl NamedFile {
         Ok(NamedFile { path, inode: (found.dev(), found.ino()) })
     }
 
-    /// Whether the name still leads to the file.
+    /// Whether the name still leads to that file.
     fn is_there(&self) -> io::Result<bool> {
         match fs::metadata(&self.path) {
             Ok(found) => Ok((found.dev(), found.ino()) == self.inode),
@@ -82,25 +82,25 @@ impl Lock {
         Ok(Lock { file, held: HeldPlace { lock, segment: Arc::default() } })
     }
 
-    /// Says to others who holds it. Only for their messages: nothing depends on it.
+    /// Writes into the lock file who holds it. Only for messages: nothing depends on it.
     pub(super) fn describe(&mut self, epoch: Epoch) {
         let about = format!("process {}, writer {epoch}\n", std::process::id());
         let _ = self.file.set_len(0).and_then(|()| self.file.write_all(about.as_bytes()));
     }
 
-    /// From now on records are written to the segment of this name.
+    /// Records are written to the segment of this name from now on.
     pub(super) fn writes(&self, segment: PathBuf) -> io::Result<()> {
         let named = NamedFile::at(segment)?;
         *self.held.segment.lock().unwrap_or_else(PoisonError::into_inner) = Some(named);
         Ok(())
     }
 
-    /// Whether the place is still this one's.
+    /// Checks whether the place still belongs to this writer.
     pub(super) fn check(&self) -> Result<(), Fault> {
         self.held.check()
     }
 
-    /// For those who ask beside the writer.
+    /// The place, for checks independent of the writer.
     pub(super) fn place(&self) -> HeldPlace {
         self.held.clone()
     }
@@ -108,7 +108,7 @@ impl Lock {
 
 impl Place for HeldPlace {
     fn check(&self) -> Result<(), Fault> {
-        // Copied, for a look may hang.
+        // Copied, because a check may hang.
         let segment = self.segment.lock().unwrap_or_else(PoisonError::into_inner).clone();
         for file in [Some(&self.lock), segment.as_ref()].into_iter().flatten() {
             if !file.is_there().map_err(|error| unseen(&file.path, error))? {

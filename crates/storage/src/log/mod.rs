@@ -1,8 +1,8 @@
 //! The log in files of one directory.
 //!
-//! Taking the writer's place: lock, read everything, then write the last segment anew under the next epoch, without its torn end.
-//! What was read may so far have been only in the system's cache (after a killed process, a failed sync); written anew and
-//! synced it is on the disk before anything is built upon it. A writer that was got past keeps a file that has no name.
+//! To take the writer's place: lock, read everything, then rewrite the last segment under the next epoch, without its torn end. What was
+//! read may so far have been only in the system's cache (after a killed process, or a failed sync); rewritten and synced, it is on disk
+//! before anything is built upon it. A superseded writer keeps a file that has no name.
 
 mod backup;
 mod compaction;
@@ -39,33 +39,33 @@ use std::sync::Arc;
 use syncer::{Active, Syncer};
 use writer::LogWriter;
 
-/// What one frame can hold is counted in 32 bits, with room for its header.
+/// Maximum of [`Options::buffered_bytes`]: the size of a frame is a 32-bit number, and its header needs room.
 const MOST_BUFFERED_BYTES: usize = 1 << 30;
 
 /// When a record counts as durable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Durability {
-    /// When it was appended: it is written soon, and the system puts it on the disk when it likes. Survives neither a loss of power
-    /// nor, for the last moments, the death of the process.
+    /// When it was appended: it is written soon, and the system decides when it reaches the disk. Survives no loss of power; the newest
+    /// records do not survive the death of the process either.
     None,
-    /// When it is on the disk; all that arrive during one sync share the next.
+    /// When it is on disk; all records that arrive during one sync share the next.
     #[default]
     Group,
-    /// When it is on the disk, by a sync of its own.
+    /// When it is on disk, by a sync of its own.
     Each,
 }
 
-/// The bounds of a log, and when its records count as durable.
+/// The limits of a log, and when its records count as durable.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Options {
     /// When a record counts as durable.
     pub durability: Durability,
-    /// The largest record, in bytes.
+    /// Maximum size of a record, in bytes.
     pub record_bytes: usize,
-    /// What may wait to be written, in bytes. As much again may be being written.
+    /// Maximum bytes that wait to be written. As many again may be in writing.
     pub buffered_bytes: usize,
-    /// A segment that has so many bytes is followed by a new one.
+    /// When a segment reaches this size, in bytes, a new one begins.
     pub segment_bytes: u64,
 }
 
@@ -101,25 +101,25 @@ impl Options {
 }
 
 impl Log {
-    /// The log in a directory, which [`Store::open`] makes if it is not there.
+    /// The log in a directory, which [`Store::open`] creates if it does not exist.
     #[must_use]
     pub fn new(directory: impl Into<PathBuf>, options: Options) -> Log {
         Log { directory: directory.into(), options, files: Arc::new(Disk) }
     }
 
-    /// The same, written through another disk than the system's: one that is slow, or fails, for tests. Reading goes to the system's.
+    /// Uses these file operations for writing instead of the system's: slow or failing ones, for tests. Reading uses the system's.
     #[must_use]
     pub fn on(self, files: Arc<dyn Files>) -> Log {
         Log { files, ..self }
     }
 
-    /// Where it is.
+    /// The log's directory.
     #[must_use]
     pub fn directory(&self) -> &Path {
         &self.directory
     }
 
-    /// Makes ready for writing what was read.
+    /// Prepares the log for writing, after it was read.
     fn take_over(&self, contents: &Contents) -> Result<Active, OpenError> {
         let io = |(action, path, source): (&'static str, PathBuf, io::Error)| OpenError::Io {
             action,
@@ -133,7 +133,7 @@ impl Log {
         let fresh = SegmentHeader { store, number: 1, first: Position(1), epoch };
         let (header, frames) = match contents.segments.last() {
             None => (fresh, &[][..]),
-            // The log ends before the snapshot does, which without syncs a loss of power can do.
+            // The log ends before the snapshot does. Without syncs, a loss of power can cause that.
             Some(segment) if segment.end() <= contents.through() => {
                 let header = SegmentHeader {
                     number: segment.header.number + 1,
@@ -155,7 +155,7 @@ impl Log {
         superfluous.extend(
             snapshots.iter().filter(|other| **other < through).map(|at| directory::snapshot(&self.directory, *at)),
         );
-        // The segment that was just begun had one of these names before it got its own.
+        // The segment that was just begun may have replaced one of these files.
         superfluous.retain(|path| path.exists());
         compaction::remove(&*self.files, &self.directory, &superfluous).map_err(io)?;
         Ok(active)
@@ -246,7 +246,7 @@ impl fmt::Display for Durability {
     }
 }
 
-/// Makes it and those above it, each durable in the one that holds it.
+/// Makes a directory and its parents; each is durable in its own parent.
 fn make_directory(files: &dyn Files, path: &Path) -> io::Result<()> {
     if path.is_dir() {
         return Ok(());

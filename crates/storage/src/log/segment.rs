@@ -1,8 +1,8 @@
 //! Reads a segment: its header, its frames, and where they end.
 //!
-//! Every frame was synced before the next was begun. So a frame that is wrong was torn by a crash only if no right one follows it,
-//! and only in the last segment; anything else is damage to what may have been acknowledged. Behind the last frame of the last segment
-//! there may be zeros, for frames that did not come.
+//! Every frame was synced before the next was begun. So a wrong frame was torn by a crash only if no correct one follows it, and only in
+//! the last segment; anything else is damage to possibly acknowledged records. After the last frame of the last segment there may be zeros,
+//! reserved for further frames.
 
 use super::format::{FRAME_HEADER, FrameHeader, RECORD_HEADER, SEGMENT_HEADER, SEGMENT_MAGIC, SegmentHeader, VERSION};
 use super::format::{u32_at, version};
@@ -14,20 +14,20 @@ use bytes::Bytes;
 #[derive(Debug)]
 pub(super) struct Segment {
     pub(super) header: SegmentHeader,
-    /// Its frames, as they are in the file, up to where they are right.
+    /// Its frames as in the file, up to the first wrong one.
     pub(super) frames: Bytes,
     pub(super) records: Vec<Record>,
     pub(super) torn: Option<TornEnd>,
 }
 
 impl Segment {
-    /// The position behind its last record.
+    /// The position after its last record.
     pub(super) fn end(&self) -> Position {
         Position(self.header.first.0 + self.records.len() as u64)
     }
 }
 
-/// Reads a header, of whatever version can be read.
+/// Reads a header, of any supported version.
 pub(super) fn header(place: &str, bytes: &[u8]) -> Result<SegmentHeader, ReadError> {
     let damaged = |what: &str| ReadError::Damaged { place: place.to_owned(), offset: 0, what: what.to_owned() };
     match version(bytes, SEGMENT_MAGIC) {
@@ -80,7 +80,7 @@ pub(super) fn read(place: &str, bytes: &Bytes, last: bool) -> Result<Segment, Re
     Ok(Segment { header, frames: bytes.slice(SEGMENT_HEADER..offset), records, torn })
 }
 
-/// The frame at an offset, if a right one stands there.
+/// The frame at an offset, if it is correct.
 fn frame_at(header: &SegmentHeader, bytes: &[u8], offset: usize) -> Option<FrameHeader> {
     let frame = FrameHeader::decode(&bytes[offset..])?;
     let begin = offset + FRAME_HEADER;
@@ -89,7 +89,7 @@ fn frame_at(header: &SegmentHeader, bytes: &[u8], offset: usize) -> Option<Frame
     right.then_some(frame)
 }
 
-/// Whether a right frame stands behind a wrong one, and where. What cannot follow is passed over without its checksum.
+/// The offset of a correct frame after a wrong one, if any. Frames that cannot follow are skipped without a checksum.
 fn later_frame(header: &SegmentHeader, bytes: &[u8], wrong: usize, expected: Position) -> Option<usize> {
     let most = expected.0 + (bytes.len() - wrong) as u64;
     (wrong + 1..bytes.len().saturating_sub(FRAME_HEADER)).find(|&offset| {
@@ -99,7 +99,7 @@ fn later_frame(header: &SegmentHeader, bytes: &[u8], wrong: usize, expected: Pos
     })
 }
 
-/// Takes the records out of a right frame; says which position comes next.
+/// Extracts the records of a correct frame; returns the next position.
 fn records_of(frame: &FrameHeader, bytes: &Bytes, offset: usize, records: &mut Vec<Record>) -> Option<Position> {
     let mut at = offset + FRAME_HEADER;
     let end = at + frame.length as usize;

@@ -11,7 +11,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 pub(super) struct Shared {
     pub(super) directory: PathBuf,
     pub(super) pending: Pending,
-    /// (number, first record) of every segment, the one that is written last.
+    /// (number, first record) of every segment; the last one is being written.
     segments: Mutex<Vec<(u64, Position)>>,
 }
 
@@ -30,7 +30,7 @@ impl Shared {
         self.segments().push((number, first));
     }
 
-    /// Forgets the segments that hold nothing after this position, and says which files they are, oldest first.
+    /// Forgets the segments that hold nothing after this position; returns their files, oldest first.
     pub(super) fn superfluous(&self, through: Position) -> Vec<PathBuf> {
         let mut segments = self.segments();
         let kept = segments.iter().skip(1).take_while(|(_, first)| *first <= through.next()).count();

@@ -1,6 +1,6 @@
-//! Writes a snapshot beside the log, and reads it.
+//! Writes a snapshot into the log's directory, and reads it.
 //!
-//! It gets its name when it is on the disk as a whole: under that name there is never a part of one.
+//! The file gets its name when it is completely on disk: a partial file never has that name.
 
 use super::directory;
 use super::files::Files;
@@ -12,10 +12,10 @@ use crc32c::crc32c;
 use std::io;
 use std::path::Path;
 
-/// It is put on the disk by pieces of so many bytes: a sync of the log waits for at most one of them.
+/// The snapshot is synced in pieces of this many bytes, so that a sync of the log waits for at most one of them.
 const PIECE: usize = 1 << 20;
 
-/// Where writing failed.
+/// The failed operation, and its error.
 pub(super) type Step = (&'static str, io::Error);
 
 pub(super) fn write(files: &dyn Files, directory: &Path, store: StoreId, snapshot: &Snapshot) -> Result<(), Step> {
@@ -24,7 +24,7 @@ pub(super) fn write(files: &dyn Files, directory: &Path, store: StoreId, snapsho
     let written = write_as(files, &temporary, store, snapshot)
         .and_then(|()| files.rename(&temporary, &path).map_err(|error| ("rename", error)));
     if written.is_err() {
-        // It has no name of a snapshot; the next writer removes it if this does not.
+        // The file has no snapshot's name; the next writer removes it if this fails.
         let _ = files.remove(&temporary);
     }
     written?;
@@ -66,7 +66,7 @@ pub(super) fn read(place: &str, bytes: &Bytes) -> Result<(StoreId, Snapshot), Re
     Ok((header.store, Snapshot { through: header.through, payload }))
 }
 
-/// The position in a snapshot's name has to be the one in it.
+/// Checks that the position in the file's name is the one in the file.
 pub(super) fn read_named(path: &Path, through: Position, bytes: &Bytes) -> Result<(StoreId, Snapshot), ReadError> {
     let place = path.display().to_string();
     let (store, snapshot) = read(&place, bytes)?;

@@ -1,7 +1,7 @@
-//! The one thread that writes: takes all that waits, one write and one sync, says how far it is, and again.
+//! The one writing thread: takes all records that wait, does one write and one sync, reports its progress, and repeats.
 //!
-//! The slower the disk, the more records share a sync. After the first error nothing is written any more: a sync that failed may
-//! have thrown away what it was to write, and one that then succeeds says nothing about it.
+//! The slower the disk, the more records share a sync. After the first error nothing is written any more: a failed sync may have dropped
+//! its data, and a later successful sync says nothing about them.
 
 use super::Durability;
 use super::directory;
@@ -17,13 +17,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// So many bytes are reserved at once. Reserving costs about as much as a sync, and is to be rare.
+/// Number of bytes reserved at once. Reserving costs about as much as a sync, and should be rare.
 const RESERVE: u64 = 1 << 20;
 
-/// After a look at the place that failed.
+/// Pause after a failed check of the place.
 const LOOK_AGAIN: Duration = Duration::from_millis(50);
 
-/// Where nobody waits for the disk, what comes within this time is written together: waking a thread costs more than an append.
+/// If nobody waits for the disk, records that arrive within this time are written together: waking a thread costs more than an append.
 const LINGER: Duration = Duration::from_millis(5);
 
 /// The segment that is written.
@@ -31,9 +31,9 @@ const LINGER: Duration = Duration::from_millis(5);
 pub(super) struct Active {
     pub(super) header: SegmentHeader,
     pub(super) file: Box<dyn LogFile>,
-    /// Of what was written.
+    /// Length of what was written, in bytes.
     pub(super) length: u64,
-    /// Zeros behind it.
+    /// Number of zeros reserved after it.
     pub(super) reserved: u64,
 }
 
@@ -47,7 +47,7 @@ pub(super) struct Syncer {
     pub(super) segment_bytes: u64,
 }
 
-/// Says that nobody writes any more, however the thread ended.
+/// Reports that no thread writes any more, in whatever way the thread ended.
 struct Ended(Arc<Shared>);
 
 impl Drop for Ended {
@@ -71,7 +71,7 @@ impl Syncer {
             }
             shared.pending.give_back(batch);
         }
-        // Everything is acknowledged. Zeros that stay are no harm.
+        // Everything is acknowledged, and remaining zeros do no harm.
         let _ = self.active.file.cut();
     }
 
@@ -106,12 +106,12 @@ impl Syncer {
         Ok(())
     }
 
-    /// Completes the frame, and puts it behind the others.
+    /// Completes the header of a frame, and appends the frame to the segment.
     fn write(&mut self, frame: &mut [u8], first: Position, count: u32) -> Result<(), Fault> {
         let active = &mut self.active;
         let (header, body) = frame.split_at_mut(FRAME_HEADER);
         let crc = active.header.checksum(active.length, first, count, body);
-        // Checked against a bound below 4 GiB when the records were appended.
+        // The length was checked against a limit below 4 GiB when the records were appended.
         let length = u32::try_from(body.len()).unwrap_or(u32::MAX);
         header.copy_from_slice(&FrameHeader { length, crc, first, count }.encode());
         active.file.write(frame).map_err(|error| self.fault("write", error))?;
@@ -120,7 +120,7 @@ impl Syncer {
         Ok(())
     }
 
-    /// What was written is acknowledged when it is on the disk and the place is still this writer's.
+    /// Acknowledges what was written when it is on disk and the place still belongs to this writer.
     fn sync(&mut self, through: Position) -> Result<(), Fault> {
         self.reserve();
         self.active.file.sync().map_err(|error| self.fault("sync", error))?;
@@ -129,8 +129,8 @@ impl Syncer {
         Ok(())
     }
 
-    /// Returns when the place is seen to be this writer's. Where it cannot be seen, nothing is known and nothing is lost: it is looked
-    /// again, until the writer is closed.
+    /// Returns when a check has shown that the place still belongs to this writer. If the check fails, nothing is known and nothing is
+    /// lost: the check is repeated until the writer is closed.
     fn check_place(&self) -> Result<(), Fault> {
         loop {
             match self.lock.check() {
@@ -140,7 +140,7 @@ impl Syncer {
         }
     }
 
-    /// For the syncs after the next one. Where the disk has no room for it, it may still have room for records.
+    /// Reserves room for the syncs after the next one. If the disk has no space for it, it may still have space for records.
     fn reserve(&mut self) {
         let active = &mut self.active;
         let bytes = RESERVE.min(self.segment_bytes.saturating_sub(active.length));
@@ -150,14 +150,14 @@ impl Syncer {
     }
 
     fn begin_segment(&mut self, first: Position) -> Result<(), Fault> {
-        // Only the last segment may have an end that is no record, however records are made durable.
+        // Only the last segment may end in something else than a record, whatever the durability.
         self.active.file.cut().map_err(|error| self.fault("cut", error))?;
         self.active.file.sync().map_err(|error| self.fault("sync", error))?;
         self.check_place()?;
         let header = SegmentHeader { number: self.active.header.number + 1, first, ..self.active.header };
         self.active = begin(&*self.files, &self.shared.directory, header, &[])
             .map_err(|(action, path, error)| fault(action, path, error))?;
-        // Before a compaction may remove the one before.
+        // This has to happen before a compaction may remove the previous segment.
         let path = directory::segment(&self.shared.directory, header.number);
         self.lock.writes(path.clone()).map_err(|error| fault("look at", path, error))?;
         self.shared.segment_begun(header.number, first);
@@ -173,10 +173,10 @@ fn fault(action: &'static str, path: PathBuf, error: io::Error) -> Fault {
     Fault::Io { action, place: path.display().to_string(), source: Arc::new(error) }
 }
 
-/// What failed, on which file, and how.
+/// The failed operation, the file, and the error.
 pub(super) type Failed = (&'static str, PathBuf, io::Error);
 
-/// Makes a segment that holds these frames. It gets its name when it is on the disk, in place of what had the name.
+/// Creates a segment with these frames. It gets its name when it is on disk, and replaces a file of that name.
 pub(super) fn begin(
     files: &dyn Files,
     directory: &Path,
@@ -188,7 +188,7 @@ pub(super) fn begin(
     let written = write_anew(files, &temporary, &header, frames)
         .and_then(|file| files.rename(&temporary, &path).map(|()| file).map_err(|error| ("rename", error)));
     if written.is_err() {
-        // It would keep the space that a full disk lacks.
+        // The temporary file would use space that a full disk lacks.
         let _ = files.remove(&temporary);
     }
     let synced = |file| {

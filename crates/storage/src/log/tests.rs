@@ -1,4 +1,4 @@
-//! With disks that fail: what is on the real one never tells.
+//! Tests with failing disks; a real disk does not fail on request.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use super::format::SEGMENT_HEADER;
@@ -10,18 +10,18 @@ use std::fs;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Fails from its n-th operation of a kind on, for good; counts what it is asked for.
+/// Faults: from the n-th operation of a kind on, all fail. Counts the operations.
 #[derive(Debug, Default)]
 struct Faults {
     fail_write_at: Option<usize>,
     fail_sync_at: Option<usize>,
-    /// Of a failing write so many bytes come through.
+    /// Number of bytes of a failing write that are written.
     part: usize,
     /// Only files whose name contains this fail.
     only: &'static str,
     writes: AtomicUsize,
     syncs: AtomicUsize,
-    /// Held by a test to keep the disk busy.
+    /// Locked by a test to keep the disk busy.
     busy: Mutex<()>,
 }
 
@@ -68,7 +68,7 @@ impl LogFile for FaultyFile {
         self.file.cut()
     }
 
-    /// Does not sync: nothing here takes the power away.
+    /// Does not sync, because these tests do not lose power.
     fn sync(&mut self) -> io::Result<()> {
         drop(self.faults.busy.lock().unwrap());
         let count = if self.concerned { self.faults.syncs.fetch_add(1, Ordering::SeqCst) } else { 0 };
@@ -121,7 +121,7 @@ fn zeros_wait_behind_the_last_record_and_a_log_that_is_left_with_them_is_whole()
     assert_eq!((recovered.records.len(), recovered.torn), (100, None));
     assert_eq!(writer.append(b"next").unwrap(), Position(101));
     writer.close().unwrap();
-    // A torn record where the zeros were is as one at the end of the file.
+    // A torn record in place of the zeros is like one at the end of the file.
     let mut torn = bytes;
     torn[written.len() + 5] = 1;
     fs::write(segment(killed.path()), torn).unwrap();
@@ -133,7 +133,7 @@ fn zeros_wait_behind_the_last_record_and_a_log_that_is_left_with_them_is_whole()
 fn a_write_that_fails_stops_the_writer_and_what_was_acknowledged_is_recovered() {
     for part in [0, 1, 25, 1_000] {
         let directory = tempfile::tempdir().unwrap();
-        // Two writes make the segment; the fifth record's is the first to fail.
+        // Two writes create the segment; the write of the fifth record is the first to fail.
         let faults = Faults { fail_write_at: Some(2 + 4), part, ..Faults::default() };
         let (log, faults) = faulty(directory.path(), Options::default(), faults);
         let (_, mut writer) = log.open().unwrap();
@@ -157,7 +157,7 @@ fn a_write_that_fails_stops_the_writer_and_what_was_acknowledged_is_recovered() 
         assert!(writer.close().is_err());
 
         let (recovered, writer) = Log::new(directory.path(), Options::default()).open().unwrap();
-        // What was written as a whole is there, though nobody was told.
+        // A completely written record is recovered, though it was not acknowledged.
         assert_eq!(payloads(&recovered.records), read);
         assert_eq!(read.len(), acknowledged.len() + usize::from(part == 1_000));
         assert_eq!(recovered.torn.is_some(), part > 0 && part < 1_000, "{part}: {:?}", recovered.torn);
@@ -304,7 +304,7 @@ fn appends_go_on_while_a_snapshot_is_made() {
 
 #[test]
 fn a_snapshot_ahead_of_the_log_counts_and_the_log_goes_on_behind_it() {
-    // Without syncs a loss of power can take the end of the log, and not the snapshot.
+    // Without syncs, a loss of power can take away the end of the log while the snapshot stays.
     let directory = tempfile::tempdir().unwrap();
     let (log, _) = faulty(directory.path(), Options::default(), Faults::default());
     let (_, mut writer) = log.open().unwrap();
@@ -357,7 +357,7 @@ fn a_writer_whose_segment_was_replaced_by_a_copy_or_removed_acknowledges_nothing
             let last = writer.append(&[7; 100]).unwrap();
             writer.durable().wait_blocking(last)
         };
-        // Also after the segment has changed.
+        // The check also works after the segment has changed.
         for _ in 0..3 {
             append(&mut writer).unwrap();
             place.check().unwrap();

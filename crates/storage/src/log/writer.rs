@@ -33,7 +33,7 @@ impl LogWriter {
         Ok(LogWriter { shared, files, store, options, place, syncer: Some(syncer), compaction: None })
     }
 
-    /// In place of what the mark said before.
+    /// Writes a mark, and replaces what it said before.
     fn write_mark(&self, name: &str, text: &str) -> Result<(), CopyError> {
         let mark = self.shared.directory.join(name);
         let temporary = directory::temporary(&mark);
@@ -48,7 +48,7 @@ impl LogWriter {
     fn end(&mut self) {
         self.shared.pending.close();
         for thread in [self.syncer.take(), self.compaction.take()].into_iter().flatten() {
-            // Its panic has stopped the log already, with a fault.
+            // A panic of the thread has stopped the log already, with a fault.
             let _ = thread.join();
         }
         self.shared.pending.stop(&Fault::Closed);
@@ -72,7 +72,7 @@ impl Writer for LogWriter {
     fn compact(&mut self, through: Position, snapshot: MakeSnapshot) -> Result<(), CompactError> {
         self.shared.pending.begin_compaction(through)?;
         if let Some(ended) = self.compaction.take() {
-            // It has said that it ended, so this waits for no more than its last instructions.
+            // The thread has reported its end, so this waits only for its last instructions.
             let _ = ended.join();
         }
         let (shared, files) = (self.shared.clone(), self.files.clone());

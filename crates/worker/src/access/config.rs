@@ -1,4 +1,4 @@
-//! Which roles callers have, by what their connection proves: users of this machine, holders of certificates.
+//! Which roles callers have, by the identity that their connection proves: a user of this machine, or the holder of a certificate.
 
 use super::Role::{Agent, Operator, Task, Viewer};
 use super::{Caller, Role};
@@ -7,18 +7,18 @@ use rustls_pki_types::CertificateDer;
 use serde::{Deserialize, Serialize};
 use webpki::EndEntityCert;
 
-/// Which roles callers have. Who runs a daemon, and root, are operators over its Unix socket.
+/// Which roles callers have. Over a Unix socket, root and the user who runs the daemon are operators, unless `users` names them otherwise.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AccessConfig {
-    /// Over TCP without TLS, where nobody proves who they are.
+    /// Roles over TCP without TLS, where no caller proves an identity.
     pub anonymous: Vec<Role>,
-    /// Users of this machine that are not named below.
+    /// Roles of users of this machine that are not named below.
     pub others: Vec<Role>,
-    /// Users of this machine.
+    /// Roles of single users of this machine.
     #[serde(rename = "user")]
     pub users: Vec<UserAccess>,
-    /// Holders of certificates; one that is not named may look.
+    /// Roles of certificate holders; a certificate that is not named here gives the role `viewer`.
     #[serde(rename = "certificate")]
     pub certificates: Vec<CertificateAccess>,
 }
@@ -27,26 +27,26 @@ pub struct AccessConfig {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct UserAccess {
-    /// Who.
+    /// The user id.
     pub uid: u32,
-    /// What they are.
+    /// The user's roles.
     pub roles: Vec<Role>,
 }
 
-/// Roles of the holder of a certificate: of one certificate, or of any that the authority made for a host.
+/// Roles of the holder of a certificate: of one certificate, or of any that the certificate authority issued for a host.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CertificateAccess {
     /// SHA-256 of the certificate in hex, colons allowed, as `openssl x509 -noout -fingerprint -sha256` prints it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fingerprint: Option<String>,
-    /// A host that the certificate is for, by name: a new certificate of the same host needs no new config.
+    /// A host name in the certificate: a new certificate of the same host needs no new config.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub host: Option<String>,
-    /// A name for people and for the audit log; the host's unless given.
+    /// A name for people and for the audit log; by default the host's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
-    /// What they are.
+    /// The holder's roles.
     pub roles: Vec<Role>,
 }
 
@@ -68,7 +68,7 @@ impl Default for AccessConfig {
 }
 
 impl AccessConfig {
-    /// What is wrong with it, if anything: the key, and the rule that it breaks.
+    /// The first fault of this config, if any: the key, and the rule that it breaks.
     pub fn fault(&self) -> Option<(String, &'static str)> {
         for (i, certificate) in self.certificates.iter().enumerate() {
             let key = |name: &str| format!("access.certificate[{i}]{name}");
@@ -87,7 +87,7 @@ impl AccessConfig {
         None
     }
 
-    /// Who a connection's other end is to a daemon that runs as `own_uid`.
+    /// The caller at the other end of a connection, for a daemon that runs as `own_uid`.
     pub fn caller(&self, identity: &Identity, own_uid: u32) -> Caller {
         let (name, roles): (String, &[Role]) = match identity {
             Identity::User { uid, .. } => {
@@ -123,7 +123,7 @@ fn fingerprint(der: &[u8]) -> String {
     })
 }
 
-/// The names of hosts that a certificate is for; the connection has checked who signed it.
+/// The host names in a certificate. Its signature was checked when the connection was accepted.
 fn hosts(der: &[u8]) -> Vec<String> {
     let der = CertificateDer::from(der);
     let Ok(certificate) = EndEntityCert::try_from(&der) else { return Vec::new() };

@@ -1,7 +1,7 @@
-//! The gate of every server: who is at the other end, and whether their roles may call the method.
+//! The gate of every server: identifies the caller, and checks whether its roles may call the method.
 //!
-//! The roles are a config's that a process was given ([`LiveAccess::new`], [`LiveAccess::replace`]), or those of a file that is read
-//! again when it changes: so the workers of a process manager, which names the file in [`ACCESS_VARIABLE`].
+//! The roles come from a config that the process was given ([`LiveAccess::new`], [`LiveAccess::replace`]), or from a file that is read
+//! again when it changes. Workers of a process manager use the file: the process manager names it in [`ACCESS_VARIABLE`].
 
 use super::refusals::{LOG_INTERVAL, Line, Refusals, Refused};
 use super::{AccessConfig, Caller, operation_of};
@@ -14,40 +14,40 @@ use tokio::sync::watch;
 use tonic::codegen::http;
 use tonic::{Code, Status};
 
-/// The environment variable with the system's config, of whose `[service.access]` a worker has the roles of its callers.
+/// The environment variable with the path of the system's config; a worker takes its callers' roles from `[service.access]` there.
 pub const ACCESS_VARIABLE: &str = "RATN_ACCESS";
 
-/// A file is looked at again at the first call after this, and by a server that is asked nothing.
+/// Minimum interval between two checks whether the file has changed. A check happens at a call, and also while a server gets no calls.
 const LOOK_AGAIN: Duration = Duration::from_secs(1);
 
-/// Roles that cannot be had from a file.
+/// Why roles cannot be read from a file.
 #[derive(Debug, thiserror::Error)]
 #[error("no roles of callers from {}: {problem}", file.display())]
 pub struct AccessError {
-    /// Which.
+    /// The file.
     pub file: PathBuf,
-    /// Why.
+    /// The reason.
     pub problem: String,
 }
 
-/// Who has which roles, as of now. A handle: clones share it.
+/// The roles in force now. A handle: clones share them.
 #[derive(Debug, Clone, Default)]
 pub struct LiveAccess {
     access: Arc<RwLock<AccessConfig>>,
     file: Option<Arc<Followed>>,
-    /// Changes when the roles have.
+    /// Notifies when the roles have changed.
     changes: watch::Sender<()>,
 }
 
-/// A file of which the roles are.
+/// A config file that is followed.
 #[derive(Debug)]
 struct Followed {
     path: PathBuf,
-    /// When it was looked at last, and as which version.
+    /// Time of the last check, and the file's modification time then.
     seen: Mutex<(Instant, Option<SystemTime>)>,
 }
 
-/// What of a system's config is read here.
+/// The part of a system's config that is read here.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 struct SystemFile {
@@ -61,15 +61,15 @@ struct ServiceSection {
 }
 
 impl LiveAccess {
-    /// As a config says.
+    /// The roles of this config.
     pub fn new(access: AccessConfig) -> LiveAccess {
         LiveAccess { access: Arc::new(RwLock::new(access)), ..LiveAccess::default() }
     }
 
-    /// As `[service.access]` of a system's config says, now and whenever that changes.
+    /// The roles in `[service.access]` of a system's config, now and whenever that file changes.
     ///
     /// # Errors
-    /// A file that cannot be read, or says something else. One that is spoilt later changes nothing.
+    /// The file cannot be read, or is malformed. If the file becomes malformed later, the roles stay as they are.
     pub fn of_file(path: &Path) -> Result<LiveAccess, AccessError> {
         let access = read(path)?;
         let seen = Mutex::new((Instant::now(), version(path)));
@@ -77,7 +77,7 @@ impl LiveAccess {
         Ok(LiveAccess { file, ..LiveAccess::new(access) })
     }
 
-    /// Of the file that [`ACCESS_VARIABLE`] names; without one the default.
+    /// The roles in the file that [`ACCESS_VARIABLE`] names; without the variable, the default roles.
     ///
     /// # Errors
     /// As [`LiveAccess::of_file`].
@@ -88,7 +88,7 @@ impl LiveAccess {
         }
     }
 
-    /// From now on; calls under way whose caller has lost something by it end.
+    /// Replaces the roles from now on. Calls under way end if their caller loses a permission by this.
     pub fn replace(&self, access: AccessConfig) {
         let before =
             std::mem::replace(&mut *self.access.write().unwrap_or_else(PoisonError::into_inner), access.clone());
@@ -97,13 +97,13 @@ impl LiveAccess {
         }
     }
 
-    /// Who a connection's other end is to a server that runs as `own_uid`.
+    /// The caller at the other end of a connection, for a server that runs as `own_uid`.
     pub fn caller(&self, identity: &Identity, own_uid: u32) -> Caller {
         self.follow();
         self.access.read().unwrap_or_else(PoisonError::into_inner).caller(identity, own_uid)
     }
 
-    /// Reads the file again where it has changed.
+    /// Reads the file again if it has changed.
     fn follow(&self) {
         if let Some(file) = &self.file {
             self.look_again(file);
@@ -142,8 +142,7 @@ fn read(path: &Path) -> Result<AccessConfig, AccessError> {
     }
 }
 
-/// Admits by the table of [`super::TABLE`]. Who runs the process, and root, are operators over
-/// its Unix socket.
+/// Admits calls by the table [`super::TABLE`]. Over the process's Unix socket, root and the user who runs the process are operators.
 #[derive(Debug, Clone)]
 pub struct RoleGate {
     access: LiveAccess,
@@ -152,7 +151,7 @@ pub struct RoleGate {
 }
 
 impl RoleGate {
-    /// With these roles.
+    /// A gate with these roles.
     pub fn new(access: LiveAccess) -> RoleGate {
         RoleGate { access, own_uid: nix::unistd::geteuid().as_raw(), refusals: Arc::default() }
     }
@@ -186,7 +185,7 @@ impl Gate for RoleGate {
 
     fn admit(&self, caller: &Caller, path: &str, _: &mut http::Extensions) -> Result<(), Status> {
         caller.admit(path).inspect_err(|_| {
-            // A path of the caller's own making would be a reason of its own each time.
+            // The caller chooses the path: as a reason, each unknown path would be logged as a new one.
             let what =
                 operation_of(path).map_or_else(|| "a method without access".to_owned(), |what| format!("{what:?}"));
             let line = self.refusals().refused(Instant::now(), Refused { who: caller.name.clone(), what });
@@ -225,7 +224,7 @@ mod tests {
         let seven = Identity::User { uid: 7, pid: None };
         write("speed = 2.0\n[service.access]\nothers = [\"task\"]\n", 1);
         let live = LiveAccess::of_file(&file).unwrap();
-        // As if it had been looked at long ago.
+        // Makes the last check look long ago.
         let roles = || {
             live.file.as_ref().unwrap().seen.lock().unwrap().0 = Instant::now() - LOOK_AGAIN;
             live.caller(&seven, 1).roles.to_vec()

@@ -1,11 +1,11 @@
-//! Who may do what: a table of operations and roles, which roles a caller has, and the gate of every server that compares the two.
+//! Access control: a table of operations and roles, the roles of callers, and the gate of every server that compares the two.
 //!
 //! ```text
 //!   uid, certificate ──AccessConfig──▶ Caller { name, roles } ──allowed(operation, roles)──▶ yes or no
 //!   /ratn.v1.ResourceService/Delete ──option (access) of the proto──▶ Operation::Delete
 //! ```
-//! A method without the option, and a service that is not of this system, is refused to everybody. What belongs to whom (leases,
-//! resources) is decided where that is known; what the table allows may still be refused there.
+//! A method without this option, and a service of another system, is refused to every caller. Ownership (of leases, of resources) is
+//! checked where the owner is known; a call that the table allows may still be refused there.
 
 mod config;
 mod gate;
@@ -23,17 +23,17 @@ use std::sync::Arc;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
-/// What a caller is in a system. One may have several.
+/// A role of a caller in a system. A caller may have several.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Role {
-    /// Looks.
+    /// May read.
     Viewer,
-    /// Runs tasks: takes resources, gives goals, changes the world.
+    /// May run tasks: take resources, give goals, change the world.
     Task,
-    /// Provides resources: process managers, the world pool, cells and drivers.
+    /// May provide resources: process managers, the world pool, cells and drivers.
     Agent,
-    /// Everything, also with what belongs to others.
+    /// May do everything, also with what belongs to others.
     Operator,
 }
 
@@ -53,7 +53,8 @@ use Operation::{
 };
 use Role::{Agent, Operator, Task, Viewer};
 
-/// Every operation, and who may. Whoever may move a robot may stop it; that it moves again is an operator's.
+/// The permission table: each operation with the roles that may do it. Every role that may move a robot may also stop it; only an operator
+/// may clear the stop.
 pub const TABLE: [(Operation, &[Role]); 13] = [
     (Ask, &[Viewer, Task, Agent, Operator]),
     (Look, &[Viewer, Task, Agent, Operator]),
@@ -70,10 +71,10 @@ pub const TABLE: [(Operation, &[Role]); 13] = [
     (Provide, &[Agent, Operator]),
 ];
 
-/// How a process is asked whether it serves.
+/// The gRPC method by which a process is asked whether it serves.
 pub const HEALTH_CHECK: &str = "/grpc.health.v1.Health/Check";
 
-/// The methods of gRPC's own that every server has.
+/// Standard gRPC methods that every server has.
 const OF_GRPC: [&str; 4] = [
     HEALTH_CHECK,
     "/grpc.health.v1.Health/List",
@@ -81,44 +82,44 @@ const OF_GRPC: [&str; 4] = [
     "/grpc.reflection.v1.ServerReflection/ServerReflectionInfo",
 ];
 
-/// What the method of a request's path does, `/ratn.v1.ResourceService/Create`. Nothing of one that is not known, or of which the proto
-/// does not say it: nobody may call that.
+/// The operation of a method, by the path of its request (`/ratn.v1.ResourceService/Create`). `None` for an unknown method, or one whose
+/// proto has no access option: nobody may call such a method.
 pub fn operation_of(path: &str) -> Option<Operation> {
     if OF_GRPC.contains(&path) { Some(Ask) } else { method_of(path)?.operation }
 }
 
-/// Whether one of these roles may.
+/// Whether one of these roles may do the operation.
 pub fn allowed(operation: Operation, roles: &[Role]) -> bool {
     TABLE.iter().any(|(row, may)| *row == operation && roles.iter().any(|role| may.contains(role)))
 }
 
-/// Somebody who was let in.
+/// An authenticated caller.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Caller {
-    /// Proven by the connection: `uid 1000`, `control (certificate)`, `anonymous`. The same name is the same caller.
+    /// The name that the connection proves: `uid 1000`, `control (certificate)`, `anonymous`. Equal names mean the same caller.
     pub name: Arc<str>,
-    /// What they are.
+    /// The caller's roles.
     pub roles: Arc<[Role]>,
 }
 
 impl Caller {
-    /// Who made a request: whom the gate let in. A request that passed none is nobody's, who may nothing.
+    /// The caller of a request, as the gate identified it. A request that passed no gate gets the caller `nobody`, without roles.
     pub fn of<T>(request: &tonic::Request<T>) -> Caller {
         let nobody = || Caller { name: "nobody".into(), roles: [].as_slice().into() };
         request.extensions().get::<Caller>().cloned().unwrap_or_else(nobody)
     }
 
-    /// A request of theirs, made inside the process.
+    /// A request by this caller, made inside the process.
     pub fn request<T>(&self, message: T) -> tonic::Request<T> {
         let mut request = tonic::Request::new(message);
         request.extensions_mut().insert(self.clone());
         request
     }
 
-    /// Whether they may call a method, by what it does.
+    /// Checks whether the caller may call a method, by its operation.
     ///
     /// # Errors
-    /// `PERMISSION_DENIED`, which says what they are, or that nobody may.
+    /// `PERMISSION_DENIED`, with the caller's roles, or with the reason why nobody may call it.
     pub fn admit(&self, path: &str) -> Result<(), Status> {
         let Some(operation) = operation_of(path) else {
             let message = format!("nobody may call {path}: no method of this version, or its proto says no `(access)`");
@@ -134,11 +135,12 @@ impl Caller {
         Err(denied("ROLE_MISSING", message))
     }
 
-    /// Whether a call of theirs to `path` may go on that began when they were `then`. It may not where they have lost anything that
-    /// they were allowed then: the call may use it at any time.
+    /// Checks whether this caller's call to `path`, begun when the caller's roles were those of `then`, may go on. The call may not go on
+    /// if the caller has lost any permission since: the call could use that permission at any time.
     ///
     /// # Errors
-    /// `PERMISSION_DENIED` where they may not call the method any more, `UNAVAILABLE` where they may call it again as what they are now.
+    /// `PERMISSION_DENIED` if the caller may not call the method any more, `UNAVAILABLE` if the caller may call it again with the present
+    /// roles.
     pub(crate) fn goes_on(&self, then: &Caller, path: &str) -> Result<(), Status> {
         let lost = |(_, may): &(Operation, &[Role])| {
             let may = |caller: &Caller| caller.roles.iter().any(|role| may.contains(role));
@@ -156,28 +158,29 @@ impl Caller {
         ))
     }
 
-    /// As a config says them: `["viewer", "task"]`.
+    /// The roles in the notation of a config: `["viewer", "task"]`.
     fn written_roles(&self) -> String {
         format!("{:?}", self.roles.iter().map(ToString::to_string).collect::<Vec<_>>())
     }
 
-    /// Whether what belongs to others is theirs to end.
+    /// Whether the caller may end what belongs to others.
     pub fn is_operator(&self) -> bool {
         self.roles.contains(&Operator)
     }
 
-    /// Whether they may give goals, and make projections, under a lease of a session that `opener` opened: their own; an agent's and an operator's word is taken for
-    /// others, for that is how one provider calls another.
+    /// Whether the caller may give goals, and make projections, under a lease of a session that `opener` opened. Everybody may under leases
+    /// of their own; agents and operators also under those of others, because one provider calls another that way.
     pub fn may_act_for(&self, opener: &str) -> bool {
         *self.name == *opener || self.is_operator() || self.roles.contains(&Agent)
     }
 
-    /// Whether they may stop, or hear of, what `giver` asked for.
+    /// Whether the caller may stop, or listen to, a goal that `giver` gave.
     pub(crate) fn may_end_for(&self, giver: &str) -> bool {
         *self.name == *giver || self.is_operator()
     }
 
-    /// Whether they may add resources of a class: a task its own, agents what the system consists of (the paper's Section V-B).
+    /// Whether the caller may create resources of a class: the role `task` its own, the role `agent` those that the system consists of (the
+    /// paper's Section V-B).
     pub fn may_create(&self, class: ResourceClass) -> bool {
         let creator = if class == ResourceClass::Task { Task } else { Agent };
         self.is_operator() || self.roles.contains(&creator)

@@ -1,4 +1,5 @@
-//! Which refusals are logged: of each caller and reason the first, then one line for each interval with how many were left out.
+//! Rate limit of the log lines on refusals: per caller and reason, the first refusal is logged, then one line per interval with the number
+//! of lines left out.
 //!
 //! ```text
 //!   refused ──▶ logged ──▶ counted for LOG_INTERVAL ──▶ logged with the count ──▶ ... ──▶ forgotten after an interval without one
@@ -9,12 +10,12 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Of one caller and reason a line is logged so often at the most.
+/// Minimum interval between two log lines of the same caller and reason.
 pub(super) const LOG_INTERVAL: Duration = Duration::from_secs(10);
-/// Callers and reasons that are told apart; the refusals of all others share one line.
+/// Maximum number of (caller, reason) pairs that are kept apart; all other refusals share one line.
 const MOST: usize = 1_024;
 
-/// Whose refusals, and what for.
+/// A caller and the reason of its refusals.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Refused {
     /// The caller's name.
@@ -37,12 +38,12 @@ struct Counted {
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Line {
     pub(super) refused: Refused,
-    /// Refusals of this caller and reason since the last line, without this one where the line tells of one.
+    /// Refusals of this caller and reason since the last line. A line that reports a refusal does not count that one.
     pub(super) left_out: u64,
 }
 
 impl Refusals {
-    /// One more; the line that is to be logged of it, if one is.
+    /// Counts a refusal; returns the line to log now, if any.
     pub(super) fn refused(&mut self, now: Instant, refused: Refused) -> Option<Line> {
         let full = self.0.len() >= MOST && !self.0.contains_key(&refused);
         let refused = if full { Refused { who: "others".into(), what: "anything".to_owned() } } else { refused };
@@ -59,7 +60,7 @@ impl Refusals {
         }
     }
 
-    /// The lines of refusals that were left out and whose interval is over.
+    /// The lines of refusals that were left out and whose interval has passed.
     pub(super) fn due(&mut self, now: Instant) -> Vec<Line> {
         let mut lines = Vec::new();
         self.0.retain(|refused, counted| {

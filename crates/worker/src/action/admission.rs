@@ -1,11 +1,11 @@
-//! Who may start: what runs, what waits and what is remembered of a server's goals, and the refusals.
+//! Admission control of goals: which goals run, wait or are remembered on a server, and which requests are refused.
 //!
 //! ```text
-//! asked ─ known ────────────────────────────→ joined, or refused: another goal has its id, or its result is forgotten
-//!   ├─ no lease, another's, one that is over ──→ refused
-//!   ├─ the manager has not told of its lease ──→ waits for that, a second at the most
-//!   ├─ one that was told to stop still moves ──→ waits for its end; refused once that one is overdue
-//!   ├─ busy, too many ────────────────────────→ refused
+//! asked ─ known ────────────────────────────→ joined, or refused: another goal has its id, or its result was forgotten
+//!   ├─ no lease, another's, an ended one ──────→ refused
+//!   ├─ its lease is not confirmed yet ─────────→ waits for that, at most a second
+//!   ├─ a goal told to stop still runs ─────────→ waits for its end; refused when that goal is overdue
+//!   ├─ busy, too many goals ───────────────────→ refused
 //!   └→ new
 //! ```
 
@@ -23,23 +23,23 @@ use ratn_proto::types::Goal;
 use std::sync::Arc;
 use tonic::{Code, Status};
 
-/// At most so many goals wait at once.
+/// Maximum number of goals that wait at once.
 const MAX_WAITING: usize = 1_024;
-/// At most so many of one caller, so that others find room.
+/// Maximum number of waiting goals of one caller, so that other callers find room.
 const MAX_WAITING_PER_CALLER: usize = 128;
-/// At most so many goals run at once on one resource.
+/// Maximum number of goals that run at once on one resource.
 const MAX_RUNNING: usize = 64;
-/// The word for programs of a refusal because too many goals wait.
+/// Reason code (for programs) of a refusal because too many goals wait.
 pub(crate) const TOO_MANY_WAITING: &str = "TOO_MANY_WAITING";
 
-/// What a server was built with.
+/// Limits that a server was built with.
 #[derive(Debug)]
 pub(super) struct Limits {
     /// A resource performs one goal at a time.
     pub(super) one_at_a_time: bool,
-    /// Results remembered of each resource.
+    /// Results remembered per resource.
     pub(super) results_kept: usize,
-    /// Goals begun on a resource under one lease.
+    /// Maximum number of goals begun on a resource under one lease.
     pub(super) goals_per_lease: usize,
 }
 
@@ -48,10 +48,10 @@ pub(super) struct Limits {
 pub(super) struct State {
     fence: Fence,
     memory: Memory,
-    /// Until their actions have returned.
+    /// Goals whose actions have not returned yet.
     running: Vec<Arc<GoalEntry>>,
     waiting: Vec<WaitingGoal>,
-    /// The provider ends: nothing begins any more.
+    /// The provider shuts down: no goal begins any more.
     closed: bool,
 }
 
@@ -61,17 +61,17 @@ struct WaitingGoal {
     entry: Arc<GoalEntry>,
 }
 
-/// What became of a request for a goal.
+/// The result of a request for a goal.
 pub(super) enum Admission {
-    /// It starts.
+    /// The goal starts.
     New,
-    /// It was known.
+    /// The goal was known: the request joins it.
     Joined(Arc<GoalEntry>),
-    /// It was told to stop while it waited.
+    /// The goal was told to stop while it waited.
     Stopped(StopCause),
-    /// It has to wait until this one, told to stop, has ended.
+    /// The goal has to wait until this other goal, which was told to stop, has ended.
     After(Arc<GoalEntry>),
-    /// It has to wait for what the resource manager says of its lease; this is the refusal if that takes too long.
+    /// The goal has to wait for the resource manager's report of its lease; this is the refusal if the report takes too long.
     Awaiting(Status),
 }
 
@@ -84,10 +84,10 @@ impl State {
         self.waiting.iter().map(|waiting| &*waiting.entry)
     }
 
-    /// Tells a goal of this id to stop, also one that waits to begin; whether there was one.
+    /// Cancels the goal of this id, also if it still waits to begin; returns whether there was such a goal.
     ///
     /// # Errors
-    /// PERMISSION_DENIED where only others gave goals of this id.
+    /// PERMISSION_DENIED if all goals of this id were given by other callers.
     pub(super) fn cancel(&self, caller: &Caller, id: &str) -> Result<bool, Status> {
         let found: Vec<&GoalEntry> = self.running().chain(self.waiting()).filter(|entry| entry.id == id).collect();
         let own: Vec<&&GoalEntry> = found.iter().filter(|entry| caller.may_end_for(&entry.giver)).collect();
@@ -100,7 +100,7 @@ impl State {
         }
     }
 
-    /// Begins nothing more, and tells every goal to stop; those that run.
+    /// Shuts down: no goal begins any more, and every goal is told to stop. Returns the running goals.
     pub(super) fn close(&mut self) -> Vec<Arc<GoalEntry>> {
         self.closed = true;
         self.running().chain(self.waiting()).for_each(|entry| entry.stop(StopCause::ShuttingDown));
@@ -110,8 +110,8 @@ impl State {
     /// The goal of the same id, lease, action and inputs, if there is one.
     ///
     /// # Errors
-    /// FAILED_PRECONDITION where its result is forgotten; ALREADY_EXISTS where another goal has its id; PERMISSION_DENIED where somebody
-    /// else gave it.
+    /// FAILED_PRECONDITION if its result has been forgotten; ALREADY_EXISTS if another goal has its id; PERMISSION_DENIED if another caller
+    /// gave it.
     pub(super) fn known(
         &self,
         limits: &Limits,
@@ -131,7 +131,7 @@ impl State {
         }
     }
 
-    /// Lets a goal in, or says why not.
+    /// Admits a goal, or says why not.
     pub(super) fn admit(
         &mut self,
         server: &Inner,
@@ -188,10 +188,10 @@ impl State {
         Ok(Admission::New)
     }
 
-    /// Stops goals of leases that are over, and forgets what was begun under them. Only what is confirmed gets here.
+    /// Stops goals whose leases are over, and forgets what was begun under those leases. Call it only for a confirmed lease.
     ///
     /// # Errors
-    /// FAILED_PRECONDITION for an older lease than one seen, where no watch says who holds the resource.
+    /// FAILED_PRECONDITION for a lease older than one already seen, if there is no watch that says who holds the resource.
     fn take_over(&mut self, authority: &Authority, lease: &Lease, resource: &str) -> Result<(), Status> {
         if authority.watch().is_none() {
             self.fence.admit(resource, lease.token).map_err(|highest: FencingToken| {
@@ -214,10 +214,10 @@ impl State {
         Ok(())
     }
 
-    /// A goal waits.
+    /// Adds a goal to those that wait.
     ///
     /// # Errors
-    /// UNAVAILABLE, to be tried again, where too many do.
+    /// UNAVAILABLE (the client may try again) if too many goals wait.
     pub(super) fn wait(&mut self, caller: &Caller, entry: &Arc<GoalEntry>) -> Result<(), Status> {
         let of_caller = self.waiting.iter().filter(|waiting| waiting.caller == caller.name).count();
         if of_caller >= MAX_WAITING_PER_CALLER {
@@ -234,19 +234,19 @@ impl State {
         Ok(())
     }
 
-    /// A goal does not wait any more.
+    /// Removes a goal from those that wait.
     pub(super) fn leave(&mut self, entry: &Arc<GoalEntry>) {
         self.waiting.retain(|waiting| !Arc::ptr_eq(&waiting.entry, entry));
     }
 
-    /// A goal's action has returned.
+    /// Records that a goal's action has returned.
     pub(super) fn end(&mut self, entry: &Arc<GoalEntry>, results_kept: usize) {
         self.running.retain(|other| !Arc::ptr_eq(other, entry));
         self.memory.end(entry, results_kept);
     }
 }
 
-/// The goal's lease, which has to name `resource`.
+/// The goal's lease; it must contain `resource`.
 fn leased<'a>(goal: &'a Goal, resource: &str) -> Result<&'a Lease, Status> {
     let names = |lease: &&Lease| lease.resources.iter().any(|leased| leased.id == resource);
     goal.lease.as_ref().filter(names).ok_or_else(|| {

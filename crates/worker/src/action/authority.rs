@@ -1,4 +1,4 @@
-//! Whether a goal's lease is one: what the resource manager says of it, and the statuses of those that are refused.
+//! Whether a goal's lease is valid: the confirmation by the resource manager, and the statuses of refusals.
 
 use super::goal::LeaseKey;
 use crate::access::Caller;
@@ -9,41 +9,41 @@ use std::time::Duration;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
-/// When a goal that was refused for now may be given again.
+/// Delay after which a goal that was refused temporarily may be given again.
 const RETRY_DELAY: Duration = Duration::from_millis(250);
-/// The word for programs of such a refusal.
+/// Reason code (for programs) of a refusal because the resource manager is not heard.
 pub(crate) const MANAGER_UNHEARD: &str = "MANAGER_UNHEARD";
 
-/// The word for programs of a refusal because the driver has not said that it is at rest.
+/// Reason code (for programs) of a refusal because the driver has not reported that the robot is at rest.
 pub(crate) const NOT_AT_REST: &str = "NOT_AT_REST";
 
-/// Who says whether a lease is one.
+/// The authority that confirms leases.
 #[derive(Debug, Default)]
 pub(super) enum Authority {
-    /// Nobody: goals that need a lease are refused.
+    /// None: goals that need a lease are refused.
     #[default]
     Nobody,
-    /// The resource manager.
+    /// The resource manager, through this watch.
     Watch(LeaseWatch),
-    /// Whoever gives the goal.
+    /// The giver of the goal: every lease is believed (for tests).
     Claimant,
 }
 
-/// A goal's lease, as far as it can be said now.
+/// Whether a goal's lease is confirmed, as known now.
 #[derive(Debug)]
 pub(super) enum Confirmation {
-    /// The manager says so.
+    /// The resource manager has confirmed it.
     Confirmed,
-    /// It may be said in a moment; else this is the refusal.
+    /// The confirmation may still come; if it does not, this is the refusal.
     Awaited(Status),
 }
 
 impl Authority {
-    /// Whether the goal's lease holds `resource`, and the caller may give goals under it. What a lease is can be read by everybody who may
-    /// look, so that a goal names it proves nothing.
+    /// Checks that the goal's lease holds `resource` and that the caller may give goals under it. Everybody with the role `viewer` can read
+    /// leases, so naming a lease proves nothing.
     ///
     /// # Errors
-    /// FAILED_PRECONDITION where it does not; PERMISSION_DENIED where the session that holds it was opened by somebody else.
+    /// FAILED_PRECONDITION if the lease does not hold the resource; PERMISSION_DENIED if another caller opened the lease's session.
     pub(super) fn confirm(
         &self,
         caller: &Caller,
@@ -108,7 +108,7 @@ impl Authority {
         })
     }
 
-    /// Whether a lease that held `resource` does not any more, now that `newest` does.
+    /// Whether a lease that held `resource` does not hold it any more, given that `newest` holds it now.
     pub(super) fn is_over(&self, resource: &str, (lease, token): LeaseKey, newest: LeaseKey) -> bool {
         match self {
             Authority::Watch(watch) => {
@@ -119,7 +119,7 @@ impl Authority {
         }
     }
 
-    /// The watch, where there is one.
+    /// The watch, if there is one.
     pub(super) fn watch(&self) -> Option<&LeaseWatch> {
         match self {
             Authority::Watch(watch) => Some(watch),
@@ -128,12 +128,12 @@ impl Authority {
     }
 }
 
-/// A status that says why in one word for programs and in a sentence for people.
+/// A status with a reason code for programs and a sentence for people.
 pub(super) fn refusal(code: Code, reason: &str, message: String) -> Status {
     Status::with_error_details(code, message, ErrorDetails::with_error_info(reason, "ratn", []))
 }
 
-/// A status that says that nothing was begun, and that the same goal may be given again in a moment.
+/// A status that says that no goal was begun, and that the same goal may be given again after a delay.
 pub(super) fn retry_later(reason: &str, message: String) -> Status {
     let mut details = ErrorDetails::with_error_info(reason, "ratn", []);
     details.set_retry_info(Some(RETRY_DELAY));

@@ -1,4 +1,4 @@
-//! What an action is given: its goal with the inputs, and access to the world model, the lease and other providers.
+//! The context of an action: its goal with the inputs, and access to the world model, the lease and other providers.
 
 use super::ActionFailure;
 use super::goal::GoalEntry;
@@ -25,15 +25,15 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
 
-/// What an action says of its progress at once, the message and the named values together, has at most so many bytes. Of a goal the last 64 are
-/// kept for a listener that is slow, so that it never keeps more than a mebibyte of them.
+/// Maximum size of one progress report in bytes, message and named values together. The last 64 reports of a goal are kept for slow
+/// listeners, so at most one mebibyte per goal.
 pub const MAX_PROGRESS_BYTES: usize = 16 * 1024;
 
-/// A goal tells of its progress at most so often in a second, and so often at once. What comes beyond that is not told, so that the sum of what it
-/// tells in a second is bounded, too.
+/// Maximum number of progress reports of a goal per second, and in one burst. Further reports are dropped, so that the total size per
+/// second is bounded, too.
 pub const MAX_PROGRESS_PER_S: u32 = 100;
 
-/// Bytes of a message that are told where the whole is too long.
+/// Bytes of the message that are kept when a report is too long.
 const SHORTENED_PROGRESS_BYTES: usize = 1024;
 
 /// A goal that an action performs.
@@ -53,7 +53,7 @@ pub struct GoalContext {
     pub projection: Option<ProjectionId>,
     /// Fires when the goal has to stop; [`GoalContext::stopped`] is how it then ends.
     pub cancelled: CancellationToken,
-    /// Who holds the lease, as the goal says.
+    /// The id of the session that holds the lease, as the goal names it.
     session: String,
     improves: Option<Vec<String>>,
     world_pool: String,
@@ -67,7 +67,7 @@ pub struct GoalContext {
 /// Why the world cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum WorldFailure {
-    /// The goal says nothing of a world pool.
+    /// The goal names no world pool.
     #[error("the goal names no world pool")]
     NoWorldPool,
     /// The goal's address of the world pool is no endpoint.
@@ -96,41 +96,41 @@ pub enum CallFailure {
     /// The resource does not say at which endpoint its actions are served.
     #[error("the endpoint of {resource}")]
     Endpoint {
-        /// Which resource.
+        /// The resource's id.
         resource: String,
-        /// What is wrong with it.
+        /// What is wrong with the endpoint.
         #[source]
         source: EndpointError,
     },
     /// The provider refused the goal, or crashed.
     #[error("{action}")]
     Call {
-        /// What it should do.
+        /// The action that was called.
         action: String,
-        /// What came of it.
+        /// The error of the call.
         #[source]
         source: CallError,
     },
-    /// The action ended otherwise than with success.
+    /// The action did not end with success.
     #[error("{action} was {outcome}: {reason}")]
     Outcome {
-        /// What it should do.
+        /// The action that was called.
         action: String,
-        /// How it ended.
+        /// The outcome.
         outcome: String,
-        /// Why.
+        /// The reason.
         reason: String,
     },
-    /// This goal was told to stop meanwhile.
+    /// This goal was told to stop during the call.
     #[error("{action} was given up: the goal shall stop")]
     Cancelled {
-        /// What it should do.
+        /// The action that was called.
         action: String,
     },
 }
 
 impl CallFailure {
-    /// What it makes of whoever called, where that is not to be aborted.
+    /// The failure of the calling goal, where that is not `aborted`.
     pub(super) fn failure(&self) -> Option<fn(String) -> ActionFailure> {
         let CallFailure::Outcome { outcome, .. } = self else { return None };
         match outcome.as_str() {
@@ -142,7 +142,7 @@ impl CallFailure {
 }
 
 impl WorldFailure {
-    /// What it makes of the goal, where that is not to be aborted: projections end with the world pool.
+    /// The failure of the goal, where that is not `aborted`: when the world pool ends, so do its projections.
     pub(super) fn failure(&self) -> Option<fn(String) -> ActionFailure> {
         let WorldFailure::Call(error) = self else { return None };
         let gone = error.is_crash() || error.code() == Some(Code::NotFound);
@@ -187,31 +187,32 @@ impl GoalContext {
         self.progress_with(message, BTreeMap::new());
     }
 
-    /// As [`GoalContext::progress`], with named values beside the message. Of what has more than [`MAX_PROGRESS_BYTES`] only the beginning of the message is
-    /// told, and what comes more often than [`MAX_PROGRESS_PER_S`] is not told.
+    /// As [`GoalContext::progress`], with named values beside the message. If a report exceeds [`MAX_PROGRESS_BYTES`], only the beginning
+    /// of its message is sent; reports beyond [`MAX_PROGRESS_PER_S`] are dropped.
     pub fn progress_with(&self, message: impl Into<String>, values: BTreeMap<String, Value>) {
         let mut left = self.progress_left.lock().unwrap_or_else(PoisonError::into_inner);
         if !left.take(MAX_PROGRESS_PER_S, MAX_PROGRESS_PER_S, Instant::now()) {
             return;
         }
         drop(left);
-        // Nobody may be listening.
+        // It is no error if nobody listens.
         let _ = self.entry.progress.send(bounded(message.into(), values));
     }
 
-    /// Whether the goal may give a result, go on and give better ones ([`GoalContext::improved`]), and if so which outputs stay as they
-    /// were in the first: others have used them. `None`: only its end counts.
+    /// `Some` if the goal may give a result, go on and give better ones ([`GoalContext::improved`]): the names of the outputs that must
+    /// stay as they were in the first result, because others have used them. `None`: only the final result counts.
     pub fn improves(&self) -> Option<&[String]> {
         self.improves.as_deref()
     }
 
-    /// Gives a result that can be used, and goes on: the first one, or one that costs less than all before. `cost_s` is what it costs whoever
-    /// uses it, in seconds of the robot's time: how long the planned motion takes. The goal is cancelled when somebody uses the result or wants
-    /// the worker; then the last one that was given counts, and how the goal ends does not matter. Never blocks.
+    /// Publishes an intermediate result that can be used, and goes on: the first one, or one that costs less than all before. `cost_s` is
+    /// its cost to the user of the result, in seconds of the robot's time: how long the planned motion takes. The goal is cancelled when
+    /// somebody uses the result or needs the worker; then the last published result counts, and how the goal ends does not matter. Never
+    /// blocks.
     ///
     /// # Errors
-    /// [`ActionFailure::Aborted`] where the goal may not ([`GoalContext::improves`]), or where that is no result of the action: too large to
-    /// be sent, a cost that is no finite number.
+    /// [`ActionFailure::Aborted`] if the goal may not publish intermediate results ([`GoalContext::improves`]), or if this is no valid
+    /// result: too large to be sent, or a cost that is not finite.
     pub fn improved(&self, outputs: BTreeMap<String, Value>, cost_s: f64) -> Result<(), ActionFailure> {
         let refused = |why: String| Err(ActionFailure::Aborted(format!("a result of {}: {why}", self.action)));
         if self.improves.is_none() {
@@ -229,7 +230,7 @@ impl GoalContext {
         Ok(())
     }
 
-    /// An error where the goal has to stop: call it with `?` between two steps of the work.
+    /// Returns an error if the goal has to stop: call it with `?` between two steps of the work.
     ///
     /// # Errors
     /// [`GoalContext::stopped`].
@@ -246,7 +247,7 @@ impl GoalContext {
         let (mut state, mut suspended) = (self.safety.watch(), self.suspended());
         let over = async {
             loop {
-                // The senders are in the goal's server, and in the goal.
+                // The senders live in the goal's server and in the goal, so the channels are open.
                 let _ = state.wait_for(|state| !matches!(state, SafetyState::Held { .. })).await;
                 if !*suspended.borrow_and_update() {
                     return;
@@ -263,12 +264,13 @@ impl GoalContext {
         self.entry.suspension()
     }
 
-    /// How a goal ends that was told to stop: `preempted`; `aborted` where its lease ended; `stopped` by an emergency stop.
+    /// The failure with which a goal ends that was told to stop: `preempted`; `aborted` if its lease ended; `stopped` after an emergency
+    /// stop.
     pub fn stopped(&self) -> ActionFailure {
         self.entry.stopped()
     }
 
-    /// Waits for `work`. Where the goal has to stop before, `work` is dropped.
+    /// Waits for `work`. If the goal has to stop before, `work` is dropped.
     ///
     /// # Errors
     /// [`GoalContext::stopped`].
@@ -280,13 +282,13 @@ impl GoalContext {
         }
     }
 
-    /// The facts that match any of the patterns, in the goal's projection (in the root world, where it has none).
+    /// The facts that match any of the patterns, in the goal's projection (without a projection: in the root world).
     ///
     /// # Errors
-    /// [`WorldFailure`]: the world pool is not known, does not answer, or the projection is gone.
+    /// [`WorldFailure`]: the goal names no world pool, the world pool does not answer, or the projection is gone.
     pub async fn facts(&self, patterns: &[FactPattern]) -> Result<Vec<FactRecord>, WorldFailure> {
         let client = self.world_client()?;
-        // It may be started again just now.
+        // The world pool may be restarting just now.
         Ok(retry_unanswered(|| client.query(self.projection, patterns)).await?)
     }
 
@@ -314,7 +316,7 @@ impl GoalContext {
     /// Calls an action of another provider whose resource this goal's lease holds, under that lease. Returns the outputs of the action.
     ///
     /// # Errors
-    /// [`CallFailure`], also where the action ends otherwise than with success.
+    /// [`CallFailure`], also if the action does not end with success.
     pub async fn call(
         &self,
         kind: &str,
@@ -339,7 +341,7 @@ impl GoalContext {
             projection: self.projection,
             world_pool: self.world_pool.clone(),
             deadline_ms: 0,
-            // Whoever asks here is a goal itself, and has its own.
+            // The caller is a goal itself, and has its own grace.
             grace_ms: 0,
             improves: None,
         };

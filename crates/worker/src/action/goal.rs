@@ -1,4 +1,4 @@
-//! One goal as the server keeps it: who listens, whether it was told to stop, how it ended.
+//! One goal as the server keeps it: its listeners, whether it was told to stop, how it ended.
 
 use super::ActionFailure;
 use crate::access::Caller;
@@ -13,10 +13,10 @@ use std::time::Duration;
 use tokio::sync::{broadcast, watch};
 use tokio_util::sync::CancellationToken;
 
-/// A listener that falls further behind misses the oldest of what a goal says before its end.
+/// Progress reports kept per goal. A listener that falls further behind misses the oldest.
 const PROGRESS_KEPT: usize = 64;
 
-/// However long a client may want to come back.
+/// Upper bound of the grace that a client may ask for.
 const MAX_GRACE: Duration = Duration::from_secs(60);
 
 /// Why a goal was told to stop.
@@ -24,35 +24,35 @@ const MAX_GRACE: Duration = Duration::from_secs(60);
 pub(crate) enum StopCause {
     /// Its client asked for it.
     Cancelled,
-    /// Nobody listens to it any more.
+    /// Nobody listens to the goal any more.
     Abandoned,
-    /// Its time is over.
+    /// The goal's deadline has passed.
     Deadline,
-    /// Somebody with a newer lease wants the resource.
+    /// A goal came under a newer lease of the resource.
     Fenced(FencingToken),
-    /// Its lease has ended.
+    /// The goal's lease has ended.
     LeaseEnded(String),
-    /// Its lease may have ended.
+    /// The goal's lease may have ended: the resource manager is not heard.
     LeaseUnheard(String),
-    /// The provider ends.
+    /// The provider shuts down.
     ShuttingDown,
-    /// An emergency stop, and why.
+    /// An emergency stop, with its reason.
     EmergencyStop(String),
 }
 
 /// How a goal ended.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Ending {
-    /// With an outcome, and whether that is because its client or its lease was gone.
+    /// With an outcome; true if the goal was orphaned: its client or its lease was gone.
     Outcome(GoalOutcome, bool),
-    /// Without one, as if the process had been killed: the provider ends, which is not the goal's doing.
+    /// Without an outcome, as if the process had been killed: the provider shuts down, which is not the goal's fault.
     Gone,
-    /// Without one: what it worked on is gone, and why. Another attempt may have more luck.
+    /// Without an outcome: the world that it worked on is gone, and why. Another attempt may succeed.
     Lost(String),
 }
 
 impl StopCause {
-    /// Whether it has nothing to do with what the goal was about.
+    /// Whether the cause has nothing to do with the goal's own work.
     pub(crate) fn is_orphaning(&self) -> bool {
         matches!(
             self,
@@ -60,7 +60,7 @@ impl StopCause {
         )
     }
 
-    /// What the goal comes to: who asked for the stop gets `preempted`, who lost the right to go on `aborted`.
+    /// The failure of a goal that stops for this cause: `preempted` if the stop was asked for, `aborted` if the right to go on was lost.
     pub(crate) fn failure(&self) -> ActionFailure {
         match self {
             StopCause::Cancelled => ActionFailure::Preempted("cancelled".to_owned()),
@@ -77,12 +77,12 @@ impl StopCause {
     }
 }
 
-/// SHA-256 of a goal's inputs as they came over the wire: a goal is not joined by one that asks for something else.
+/// SHA-256 of a goal's inputs as received: a request with other inputs does not join the goal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Fingerprint([u8; 32]);
 
 impl Fingerprint {
-    /// Of a goal; of one that is missing as of one without inputs.
+    /// The fingerprint of a goal; a missing goal counts as one without inputs.
     pub(crate) fn of(goal: Option<&v1::Goal>) -> Fingerprint {
         let mut digest = ring::digest::Context::new(&ring::digest::SHA256);
         if let Some(goal) = goal {
@@ -94,7 +94,7 @@ impl Fingerprint {
     }
 }
 
-/// A lease as it was granted: its id, and its token.
+/// A lease as it was granted: its id and its fencing token.
 pub(crate) type LeaseKey = (LeaseId, FencingToken);
 
 /// A goal that waits to begin, is under way, or has ended and is remembered.
@@ -105,31 +105,31 @@ pub(crate) struct GoalEntry {
     pub(crate) giver: Arc<str>,
     pub(crate) action: String,
     pub(crate) inputs: Fingerprint,
-    /// The resource that it has to itself where the server takes one goal at a time.
+    /// The resource that performs it; if the server takes one goal at a time, the goal has it exclusively.
     pub(crate) resource: String,
     pub(crate) lease: Option<LeaseKey>,
-    /// Whose lease that is, as the goal says; may be empty.
+    /// The session that holds the lease, as the goal names it; may be empty.
     pub(crate) session: String,
     pub(crate) cancelled: CancellationToken,
-    /// How far it is.
+    /// Progress reports.
     pub(crate) progress: broadcast::Sender<v1::GoalProgress>,
-    /// The last result that can be used; whoever listens hears of it, also who comes later.
+    /// The last intermediate result; every listener gets it, also one that comes later.
     pub(crate) improved: watch::Sender<Option<v1::GoalImproved>>,
     pub(crate) result: watch::Sender<Option<Ending>>,
-    /// Fires when its action has returned; an action that does not stop in time does so after its result was told.
+    /// Fires when the goal's action has returned. If an action does not stop in time, this is after its result was sent.
     pub(crate) returned: CancellationToken,
-    /// It stands still, for its lease may have ended.
+    /// The goal is suspended, because its lease may have ended.
     suspended: watch::Sender<bool>,
     stop_when_abandoned: bool,
-    /// For how long nobody may listen to it.
+    /// How long the goal may have no listener.
     grace: Duration,
     cause: Mutex<Option<StopCause>>,
     listeners: AtomicUsize,
-    /// How often its last listener has left.
+    /// How often the last listener has left.
     left: AtomicUsize,
 }
 
-/// Somebody who waits for a goal's result.
+/// A client that waits for a goal's result.
 #[derive(Debug)]
 pub(crate) struct Listener(Arc<GoalEntry>);
 
@@ -168,18 +168,18 @@ impl GoalEntry {
         Listener(Arc::clone(self))
     }
 
-    /// Tells it to stop; the first cause counts.
+    /// Tells the goal to stop; the first cause counts.
     pub(crate) fn stop(&self, cause: StopCause) {
         self.blame(cause);
         self.cancelled.cancel();
     }
 
-    /// Why it ends, if it ends without success.
+    /// Sets why the goal ends, in case it ends without success.
     pub(crate) fn blame(&self, cause: StopCause) {
         self.cause.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(cause);
     }
 
-    /// Suspends it, or lets it go on.
+    /// Suspends the goal, or lets it go on.
     pub(crate) fn suspend(&self, suspended: bool) {
         self.suspended.send_if_modified(|now| std::mem::replace(now, suspended) != suspended);
     }
@@ -196,18 +196,18 @@ impl GoalEntry {
         self.result.borrow().is_some()
     }
 
-    /// Returns once its result is there.
+    /// Returns when the goal's result is there.
     pub(crate) async fn over(&self) {
         // The sender is in `self`, so the channel is open.
         let _ = self.result.subscribe().wait_for(Option::is_some).await;
     }
 
-    /// Why it was told to stop.
+    /// Why the goal was told to stop.
     pub(crate) fn cause(&self) -> Option<StopCause> {
         self.cause.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// What being told to stop makes of the goal.
+    /// The failure that follows from being told to stop.
     pub(crate) fn stopped(&self) -> ActionFailure {
         self.cause().unwrap_or(StopCause::Cancelled).failure()
     }
@@ -229,7 +229,7 @@ impl Drop for Listener {
     }
 }
 
-/// Stops a goal to which nobody has listened again for its grace since its last listener left the `left`-th time.
+/// Stops a goal that has had no listener for its grace, since its last listener left for the `left`-th time.
 async fn abandoned(goal: Arc<GoalEntry>, left: usize) {
     tokio::select! {
         () = goal.over() => return,

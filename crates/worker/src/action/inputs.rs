@@ -1,10 +1,10 @@
-//! A goal's inputs by name and type: each type as one that must be there, and as one that may be.
+//! Typed access to a goal's inputs by name: for each type a required and an optional form.
 
 use super::{GoalContext, InputError, Port};
 use ratn_model::pose::Pose;
 use ratn_model::value::{Trajectory, Value};
 
-/// An `input_…` and an `optional_…` for each type, as [`Port`] reads it.
+/// Generates `input_…` and `optional_…` for each type, as [`Port`] reads it.
 macro_rules! inputs {
     ($($input:ident, $optional:ident, $read:ident, $what:literal, $of:ty;)*) => {
         impl GoalContext {
@@ -12,7 +12,7 @@ macro_rules! inputs {
                 #[doc = concat!("An input that must be ", $what, ".")]
                 ///
                 /// # Errors
-                /// [`InputError`] with the action and the input, where it is missing or something else.
+                /// [`InputError`] with the action and the input, if it is missing or of another type.
                 pub fn $input(&self, name: &str) -> Result<$of, InputError> {
                     self.port(name).$read()
                 }
@@ -20,7 +20,7 @@ macro_rules! inputs {
                 #[doc = concat!("An input that is ", $what, " if it is there.")]
                 ///
                 /// # Errors
-                /// [`InputError`] with the action and the input, where it is something else.
+                /// [`InputError`] with the action and the input, if it is of another type.
                 pub fn $optional(&self, name: &str) -> Result<Option<$of>, InputError> {
                     self.port(name).optional().map(|port| port.$read()).transpose()
                 }
@@ -44,7 +44,7 @@ inputs! {
 }
 
 impl GoalContext {
-    /// The input `name`, there or not: `goal.port("region").field("pose").pose()?`.
+    /// The input `name`, present or not: `goal.port("region").field("pose").pose()?`.
     pub fn port(&self, name: &str) -> Port<'_> {
         Port::of(&self.action, name, self.inputs.get(name))
     }

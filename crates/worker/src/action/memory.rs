@@ -1,11 +1,11 @@
-//! Which goals a provider has begun, so that none is begun twice.
+//! Remembers which goals a provider has begun, so that no goal is begun twice.
 //!
-//! A goal is known by its id, the resource that performs it, and the lease under which it was given (id and token): nobody can take the
-//! id of another's goal. The same goal asks for the same action with the same inputs.
+//! A goal is identified by its id, the resource that performs it, and its lease (id and token): nobody can take the id of another's goal.
+//! Two requests are for the same goal only if action and inputs are equal, too.
 //!
-//! Two memories with different bounds. Of the goals of every lease that still holds its resource every **id** is kept: given again, such
-//! a goal is joined, gets its result, or is refused, and under a lease that is over nothing begins at all. So that a goal is never begun
-//! twice does not depend on how many **results** are kept: of those the newest of each resource are.
+//! There are two memories with different bounds. The **ids** of all goals are kept as long as their lease holds its resource: such a goal,
+//! given again, is joined, gets its result, or is refused. Under a lease that is over no goal begins. The guarantee that no goal is begun
+//! twice therefore does not depend on how many **results** are kept: of those, only the newest of each resource are.
 
 use super::goal::{Fingerprint, GoalEntry, LeaseKey};
 use ratn_model::id::{FencingToken, LeaseId};
@@ -15,11 +15,11 @@ use std::sync::Arc;
 /// The goals of a server.
 #[derive(Debug, Default)]
 pub(super) struct Memory {
-    /// Under way, or with a result that is kept.
+    /// Goals under way, or with a result that is kept.
     entries: BTreeMap<Key, Arc<GoalEntry>>,
-    /// Whose results are kept, the oldest first, by resource.
+    /// Goals whose results are kept, the oldest first, by resource.
     ended: BTreeMap<String, VecDeque<Key>>,
-    /// What was begun under each lease of each resource.
+    /// Ids of the goals begun under each lease of each resource.
     begun: BTreeMap<(String, LeaseKey), BTreeSet<String>>,
 }
 
@@ -30,7 +30,7 @@ struct Key {
     lease: Option<LeaseKey>,
 }
 
-/// A goal that is asked for.
+/// The identity of a requested goal.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Asked<'a> {
     pub(super) goal: &'a str,
@@ -48,9 +48,9 @@ pub(super) enum Known {
     Entry(Arc<GoalEntry>),
     /// It was begun, has ended, and its result is not kept any more.
     ResultForgotten(LeaseId),
-    /// Another goal has its id, and what differs.
+    /// Another goal has its id; the text says what differs.
     Other(String),
-    /// It was not begun, as far as leases that live go.
+    /// It was not begun under any lease that is still live.
     Never,
 }
 
@@ -82,7 +82,7 @@ impl Memory {
         {
             return Known::ResultForgotten(lease.0);
         }
-        // A holder gives a goal under one lease. Another holder's goals are none of its business.
+        // Within one session, an id may be used under one lease only. Goals of other sessions do not matter.
         let same_id = self.entries.range(key(None)..).map(|(_, entry)| entry);
         let mut same_id = same_id.take_while(|entry| entry.resource == asked.resource && entry.id == asked.goal);
         match same_id.find(|entry| entry.session == asked.session) {
@@ -95,19 +95,19 @@ impl Memory {
         }
     }
 
-    /// How many goals were begun on a resource under a lease.
+    /// Number of goals begun on a resource under a lease.
     pub(super) fn begun_under(&self, resource: &str, lease: LeaseKey) -> usize {
         self.begun.get(&(resource.to_owned(), lease)).map_or(0, BTreeSet::len)
     }
 
-    /// A goal begins.
+    /// Records that a goal begins.
     pub(super) fn begin(&mut self, entry: &Arc<GoalEntry>) {
         self.entries.insert(Key::of(entry), Arc::clone(entry));
         let Some(lease) = entry.lease.filter(|_| !entry.resource.is_empty()) else { return };
         self.begun.entry((entry.resource.clone(), lease)).or_default().insert(entry.id.clone());
     }
 
-    /// A goal has ended; of its resource so many results are kept.
+    /// Records that a goal has ended; keeps `results_kept` results of its resource.
     pub(super) fn end(&mut self, entry: &GoalEntry, results_kept: usize) {
         let ended = self.ended.entry(entry.resource.clone()).or_default();
         ended.push_back(Key::of(entry));
@@ -118,7 +118,7 @@ impl Memory {
         }
     }
 
-    /// Forgets what was begun on a resource under leases that are over: under them nothing begins any more.
+    /// Forgets the goals begun on a resource under leases that are over: no goal begins under those any more.
     pub(super) fn forget_begun(&mut self, resource: &str, is_over: impl Fn(LeaseKey) -> bool) {
         let least = (resource.to_owned(), (LeaseId(0), FencingToken(0)));
         let of_resource = self.begun.range(least..).map(|(key, _)| key).take_while(|(of, _)| of == resource);
@@ -185,7 +185,7 @@ mod tests {
         assert!(matches!(find(&memory, "a9", "arm", 1), Known::Entry(_)));
         assert!(matches!(find(&memory, "a0", "arm", 1), Known::ResultForgotten(LeaseId(1))));
         assert_eq!((memory.begun_under("arm", key(1)), memory.begun_under("arm", key(2))), (10, 0));
-        // Another one that holds the resource, too.
+        // The same with another resource under another lease.
         perform(&mut memory, "b", "arm", 2);
         assert!(matches!(find(&memory, "a0", "arm", 1), Known::ResultForgotten(LeaseId(1))));
         memory.forget_begun("arm", |lease| lease == key(1));

@@ -56,13 +56,13 @@ pub trait Action: Send + Sync + 'static {
         None
     }
 
-    /// What inputs of goals, and outputs after `success`, are checked against: the signature, unless a catalogue says it
-    /// ([`Signature::bundled`]).
+    /// The signature against which inputs of goals, and outputs after `success`, are checked: by default the action's own; for an action of
+    /// the bundled system, the one in the catalogue ([`Signature::bundled`]).
     fn checked_by(&self) -> Option<Signature> {
         self.signature()
     }
 
-    /// The id of the resource whose lease a goal needs, where that is not the worker's own.
+    /// The id of the resource whose lease a goal needs, if it is not the worker's own.
     fn resource(&self) -> Option<&str> {
         None
     }
@@ -72,11 +72,11 @@ pub trait Action: Send + Sync + 'static {
         self.resource().into_iter().collect()
     }
 
-    /// The id of the resource whose lease this goal needs, for an action that several resources share, as the arms of a robot do. It is asked
-    /// whenever the goal is given, and has to answer the same every time. Whatever it answers, the lease is confirmed for that resource.
+    /// The id of the resource whose lease this goal needs, for an action that several resources share, as the arms of a robot do. It is called
+    /// whenever the goal is given, and has to return the same every time. The lease is confirmed for the returned resource in any case.
     ///
     /// # Errors
-    /// Why the goal is for none of the resources, or which of them it is for cannot be told: the goal is refused with that sentence.
+    /// The goal is for none of the resources, or it is unclear for which one: the goal is refused with this sentence.
     fn resource_for(&self, _goal: &Goal) -> Result<Option<&str>, NoResource> {
         Ok(self.resource())
     }
@@ -99,7 +99,7 @@ pub trait Action: Send + Sync + 'static {
     async fn execute(&self, goal: GoalContext) -> ActionResult;
 }
 
-/// Why it cannot be told which resource's lease a goal needs; what to do about it is in the sentence.
+/// Why it is unclear which resource's lease a goal needs; the sentence also says what to do.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NoResource {
     /// An input of the goal names none of them: the goal is refused as `INVALID_ARGUMENT`.

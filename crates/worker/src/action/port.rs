@@ -15,26 +15,26 @@ pub struct Port<'a> {
 /// An input that is missing or of another type.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InputError {
-    /// It is not there.
+    /// The input is missing.
     #[error("input `{port}`{} is missing: expected {expected}", of(action))]
     Missing {
         /// The action; empty where it is not an action's.
         action: String,
-        /// Its path, `region.size`.
+        /// The input's path, `region.size`.
         port: String,
-        /// What it should be.
+        /// The expected type.
         expected: &'static str,
     },
-    /// It is something else.
+    /// The input is of another type.
     #[error("input `{port}`{} is {found}: expected {expected}", of(action))]
     WrongType {
         /// The action; empty where it is not an action's.
         action: String,
-        /// Its path.
+        /// The input's path.
         port: String,
-        /// What it should be.
+        /// The expected type.
         expected: &'static str,
-        /// What it is.
+        /// The type of the value.
         found: String,
     },
 }

@@ -1,11 +1,11 @@
-//! One goal from its beginning to its end.
+//! Runs one goal from its beginning to its end.
 //!
 //! ```text
-//! begun ─ the action returns ─────────────────→ result told, place free
-//!    └─ told to stop ─ it does not for a grace ─→ result told ─ the action returns ─→ place free
-//!                                                      └─ it does not for much longer ─→ the server is stuck
+//! begun ─ the action returns ─────────────────→ result sent, resource free
+//!    └─ told to stop ─ runs on after the grace ─→ result sent ─ the action returns ─→ resource free
+//!                                                      └─ runs on for much longer ─→ the server is stuck
 //! ```
-//! A goal has its resource until its action has returned, whatever was told of it before.
+//! A goal keeps its resource until its action has returned, even if a result was sent earlier.
 
 use super::context::bounded as bounded_progress;
 use super::goal::{Ending, GoalEntry, StopCause};
@@ -23,10 +23,11 @@ use std::time::Duration;
 use tokio::task::JoinError;
 use tracing::Instrument;
 
-/// Of a goal that was told to stop and does not the result is told after this long; it keeps its resource until it has ended.
+/// How long an action may take to return after its goal was told to stop. Then the goal's result is sent, but the goal keeps its resource
+/// until the action has returned.
 pub const STOP_GRACE: Duration = Duration::from_secs(3);
 
-/// A reason is for people; of a longer one the beginning is told.
+/// Maximum size of the reason, a text for people; a longer one is truncated.
 const MAX_REASON_BYTES: usize = 64 * 1024;
 
 /// Runs a goal to its end, whatever its action does.
@@ -41,7 +42,7 @@ pub(super) async fn run(
     let performing = trace::within_any(trace::current(), async move {
         match context.safety.state() {
             SafetyState::Stopped { reason } => Err(ActionFailure::emergency_stop(&reason)),
-            // It may have been told to stop since it was admitted.
+            // The goal may have been told to stop since it was admitted.
             _ => match context.checkpoint() {
                 Ok(()) => perform(&*action, context).await,
                 Err(stopped) => Err(stopped),
@@ -54,7 +55,7 @@ pub(super) async fn run(
             tokio::time::sleep(Duration::from_millis(deadline_ms)).await;
             entry.stop(StopCause::Deadline);
         }
-        // It only tells the goal to stop; the goal ends by itself, or is overdue.
+        // A deadline only tells the goal to stop; the goal then ends by itself, or is overdue.
         std::future::pending::<Infallible>().await
     };
     let stopped = async {
@@ -82,13 +83,13 @@ pub(super) async fn run(
     let lost = result.as_ref().is_err_and(|failure| matches!(failure, ActionFailure::Lost(_)));
     let outcome = bounded(result.unwrap_or_else(GoalOutcome::from));
     let outcome = match entry.cause() {
-        // Whatever the action makes of being stopped.
+        // After an emergency stop the outcome is `stopped`, unless the action succeeded.
         Some(cause @ StopCause::EmergencyStop(_)) if !outcome.is_success() => cause.failure().into(),
         _ => outcome,
     };
     tracing::debug!(goal = %entry.id, outcome = %outcome.outcome, reason = %outcome.reason, "ended");
     if returned {
-        // No longer running before anybody hears of its end: the next goal must find its place free.
+        // Remove the goal from the running ones before its end is announced: the next goal must find the resource free.
         server.state().end(&entry, server.limits.results_kept);
     }
     let ending = match entry.cause() {
@@ -104,7 +105,7 @@ pub(super) async fn run(
         let (goal, action, resource) = (&entry.id, &entry.action, &entry.resource);
         let grace_s = STOP_GRACE.as_secs();
         tracing::error!(%goal, %action, %resource, grace_s, "a goal that was told to stop still runs: nothing begins beside it");
-        // Not torn down: what it does in threads or on a device would go on unseen.
+        // The action is not aborted: its work in threads or on a device would go on unseen.
         let patience = server.stuck_after.unwrap_or(Duration::MAX);
         if tokio::time::timeout(patience, &mut performing).await.is_err() {
             let told_s = (STOP_GRACE + patience).as_secs();
@@ -119,14 +120,14 @@ pub(super) async fn run(
     entry.returned.cancel();
 }
 
-/// Says of a goal that a hold is in force or that it is suspended, and when that is over: else nobody who waits for it would know.
+/// Reports as progress that a goal is held or suspended, and when that ends, so that its caller knows why nothing happens.
 async fn tell_pauses(entry: &GoalEntry, safety: &Safety) -> Infallible {
     let (mut state, mut suspended) = (safety.watch(), entry.suspension());
     let mut told = None;
     loop {
         let pauses = match &*state.borrow_and_update() {
             SafetyState::Held { reason } => Some(format!("a hold is in force: {reason}")),
-            // It ends, and its end says so.
+            // The goal ends, and its result says so.
             SafetyState::Stopped { .. } => told.clone(),
             SafetyState::Ready => {
                 suspended.borrow_and_update().then(|| "stands still: the resource manager is not heard".to_owned())
@@ -134,11 +135,11 @@ async fn tell_pauses(entry: &GoalEntry, safety: &Safety) -> Infallible {
         };
         if pauses != told {
             let message = pauses.clone().unwrap_or_else(|| "goes on".to_owned());
-            // Nobody may listen.
+            // It is no error if nobody listens.
             let _ = entry.progress.send(bounded_progress(message, BTreeMap::new()));
             told = pauses;
         }
-        // The senders are in the goal and in its server.
+        // The senders live in the goal and in its server.
         tokio::select! {
             _ = state.changed() => {}
             _ = suspended.changed() => {}
@@ -146,7 +147,7 @@ async fn tell_pauses(entry: &GoalEntry, safety: &Safety) -> Infallible {
     }
 }
 
-/// Performs a goal that is as the action says, and sees that what comes of it is.
+/// Performs a goal, and checks its inputs before and its outputs after against the action's signature.
 async fn perform(action: &dyn Action, mut context: GoalContext) -> ActionResult {
     let Some(signature) = action.checked_by() else { return action.execute(context).await };
     let name = context.action.clone();
@@ -156,7 +157,7 @@ async fn perform(action: &dyn Action, mut context: GoalContext) -> ActionResult 
     Ok(outcome)
 }
 
-/// An outcome whose outputs fit into a message, with a reason that does; a failure that says what does not, otherwise.
+/// Returns the outcome, with a reason short enough, if its outputs fit into a message; otherwise a failure that names what is too large.
 fn bounded(mut outcome: GoalOutcome) -> GoalOutcome {
     if outcome.reason.len() > MAX_REASON_BYTES {
         let bytes = outcome.reason.len();

@@ -1,4 +1,4 @@
-//! The scene of a goal's projection: fetched as what it differs by from one that the worker has.
+//! The scene of a goal's projection, fetched as the difference from a scene that the worker has.
 
 use super::GoalContext;
 use super::context::WorldFailure;
@@ -8,10 +8,10 @@ use ratn_world::scene::Scene;
 use ratn_world::scene::delta::Scenes;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Scenes that a worker keeps, to be sent only what is otherwise in the next.
+/// Number of scenes that a worker keeps as bases of such differences.
 const MAX_KEPT: usize = 8;
 
-/// The scenes that an action used last; it has one for as long as it lives.
+/// The scenes that an action used last; an action keeps one cache for its whole lifetime.
 #[derive(Debug)]
 pub struct SceneCache(Mutex<Scenes>);
 
@@ -28,10 +28,10 @@ impl SceneCache {
 }
 
 impl GoalContext {
-    /// The geometric scene of the goal's projection (of the root, where it has none), made of the facts that it shows.
+    /// The geometric scene of the goal's projection (without a projection: of the root), derived from its facts.
     ///
     /// # Errors
-    /// [`WorldFailure`]; also where a geometric fact makes no geometry.
+    /// [`WorldFailure`]; also if a geometric fact yields no geometry.
     pub async fn scene(&self, cache: &SceneCache) -> Result<Arc<Scene>, WorldFailure> {
         let client = self.world_client()?;
         let bases: Vec<Digest> = cache.kept().digests().collect();
@@ -39,7 +39,7 @@ impl GoalContext {
         if let Ok(scene) = cache.kept().apply(&delta) {
             return Ok(scene);
         }
-        // Other goals have used others meanwhile.
+        // Other goals may have evicted the base meanwhile.
         let whole = retry_unanswered(|| client.scene(self.projection, &[])).await?;
         Ok(cache.kept().apply(&whole)?)
     }

@@ -1,4 +1,4 @@
-//! A server of actions: how it is built, and its requests.
+//! The action server: its builder and its requests.
 
 use super::admission::{Admission, Limits, State};
 use super::authority::{Authority, refusal};
@@ -28,9 +28,9 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Code, Status};
 use tracing::Instrument;
 
-/// Of each resource so many results are remembered unless said otherwise.
+/// Default number of results remembered per resource.
 const RESULTS_KEPT: usize = 64;
-/// Under one lease so many goals are begun on a resource at the most, unless said otherwise: the id of each is remembered.
+/// Default maximum of goals begun on a resource under one lease; the id of each is remembered.
 const GOALS_PER_LEASE: usize = 65_536;
 
 /// Performs goals. A handle: clones share everything.
@@ -60,7 +60,7 @@ pub(super) struct Inner {
     pub(super) kind: String,
     pub(super) actions: BTreeMap<String, Arc<dyn Action>>,
     pub(super) limits: Limits,
-    /// A goal that was told to stop makes the server stuck when it runs for so long behind its grace; nothing where none does.
+    /// How long a goal that was told to stop may run on after its grace before the server counts as stuck; `None`: never.
     pub(super) stuck_after: Option<Duration>,
     /// Why the server is stuck, once it is.
     pub(super) stuck: watch::Sender<Option<String>>,
@@ -70,7 +70,7 @@ pub(super) struct Inner {
     state: Mutex<State>,
 }
 
-/// A goal's place among those that wait; dropped, it is left.
+/// A goal's place among those that wait; dropping it gives up the place.
 struct Waiting {
     server: Arc<Inner>,
     entry: Arc<GoalEntry>,
@@ -101,10 +101,10 @@ impl ActionServerBuilder {
         WorkerDescription { provider: self.provider.clone(), kind: self.kind.clone(), actions }
     }
 
-    /// Whether all of that is believed by whoever asks: what is beyond the bounds is told here, to who wrote it.
+    /// Checks whether clients will accept the description: its author learns here about a violated bound.
     ///
     /// # Errors
-    /// [`DescriptionError`] of the first thing that is not.
+    /// [`DescriptionError`] of the first violation.
     pub fn check(&self) -> Result<(), DescriptionError> {
         for (name, action) in &self.actions {
             action.signature().map_or(Ok(()), |signature| signature.check_defaults(name))?;
@@ -113,8 +113,8 @@ impl ActionServerBuilder {
         check_size(&described(&self.resource, (&self.provider, &self.kind), &self.actions))
     }
 
-    /// A resource performs one goal at a time. A further goal is refused; but where the one before was told to stop, the further one waits
-    /// for its end.
+    /// Makes a resource perform one goal at a time. A further goal is refused; but if the goal before it was told to stop, the further goal
+    /// waits for its end.
     #[must_use]
     pub fn one_at_a_time(mut self) -> ActionServerBuilder {
         self.one_at_a_time = true;
@@ -242,16 +242,16 @@ impl ActionServer {
         }
     }
 
-    /// Resolves, with the reason for people, when a goal that was told to stop still runs after [`ActionServerBuilder::stuck_after`]. Only the
-    /// end of the process ends it.
+    /// Resolves, with the reason for people, when a goal that was told to stop still runs after [`ActionServerBuilder::stuck_after`]. Such
+    /// a goal ends only with the process.
     pub async fn stuck(&self) -> String {
         let mut stuck = self.inner.stuck.subscribe();
         let why = stuck.wait_for(Option::is_some).await.ok().and_then(|why| why.clone());
-        // The sender is this server's.
+        // The sender belongs to this server.
         why.unwrap_or_default()
     }
 
-    /// Tells a goal to stop, also one that waits to begin. False where there is no such goal.
+    /// Tells a goal to stop, also if it still waits to begin. False if there is no such goal.
     pub fn cancel(&self, goal: &str) -> bool {
         let state = self.inner.state();
         let found = state.running().chain(state.waiting()).filter(|entry| entry.id == goal);
@@ -268,11 +268,11 @@ impl ActionServer {
         self.inner.state().waiting().count()
     }
 
-    /// Finds a goal that was given before under the lease that it names; what is to be heard of it.
+    /// Finds a goal that was given before under the lease that it names; returns its messages.
     ///
     /// # Errors
-    /// NOT_FOUND where it was never given under a lease that lives; FAILED_PRECONDITION where only its result has been forgotten;
-    /// ALREADY_EXISTS where another goal has its id; PERMISSION_DENIED where somebody else gave it.
+    /// NOT_FOUND if the goal was never given under a live lease; FAILED_PRECONDITION if only its result has been forgotten; ALREADY_EXISTS
+    /// if another goal has its id; PERMISSION_DENIED if another caller gave it.
     pub(super) fn join(&self, caller: &Caller, goal: &Goal, inputs: Fingerprint) -> Result<Messages, Status> {
         let (action, resource) = self.inner.performer(goal)?;
         let entry = GoalEntry::new(caller, goal, inputs, resource, action.cancel_when_abandoned());
@@ -285,7 +285,7 @@ impl ActionServer {
         }
     }
 
-    /// Starts a goal, or finds the one of the same id, lease, action and inputs; what is to be heard of it.
+    /// Starts a goal, or finds the one of the same id, lease, action and inputs; returns its messages.
     ///
     /// # Errors
     /// A status that says why not.
@@ -295,7 +295,7 @@ impl ActionServer {
         let heard_by = Instant::now() + GRANT_WAIT;
         let mut waiting = None;
         loop {
-            // What is heard from here on is not missed.
+            // Subscribe first, so that no update from here on is missed.
             let heard = self.inner.authority.watch().map(LeaseWatch::heard);
             let admission = self.inner.state().admit(&self.inner, caller, &goal, &entry)?;
             let (predecessor, refused) = match admission {
@@ -306,7 +306,7 @@ impl ActionServer {
                     return Ok(Messages::of(&entry, false));
                 }
                 Admission::New => {
-                    // Listens before the action can say anything.
+                    // Subscribe before the action can report anything.
                     let messages = Messages::of(&entry, false);
                     let deadline_ms = goal.deadline_ms;
                     let (channels, safety) = (self.inner.channels.clone(), self.inner.safety.clone());
@@ -321,7 +321,7 @@ impl ActionServer {
                 Admission::Awaiting(refused) => (None, Some(refused)),
             };
             if waiting.is_none() {
-                // Whoever closes or cancels between the two looks is met at the next one.
+                // A close or cancel between two checks is found at the next check.
                 self.inner.state().wait(caller, &entry)?;
                 waiting = Some(Waiting { server: Arc::clone(&self.inner), entry: Arc::clone(&entry) });
                 continue;
@@ -335,7 +335,7 @@ impl ActionServer {
             tokio::select! {
                 biased;
                 () = entry.cancelled.cancelled() => {}
-                // Also one that is cleared before the goal's turn: nobody expects a motion then.
+                // A stop counts even if it is cleared before the goal's turn: nobody expects a motion then.
                 reason = self.inner.safety.stopped() => entry.stop(StopCause::EmergencyStop(reason)),
                 () = changed(heard) => {}
                 () = over => if let Some(refused) = refused {
@@ -346,7 +346,7 @@ impl ActionServer {
     }
 }
 
-/// Returns when something was heard; never where there is nothing to hear.
+/// Returns at the next update of the watch; never returns without a watch.
 async fn changed(heard: Option<watch::Receiver<u64>>) {
     match heard {
         // The sender is in the watch, which is in the server.
@@ -413,7 +413,7 @@ impl LeaseListener for Inner {
             });
             match standing {
                 Some(ClaimStatus::Confirmed) => goal.suspend(false),
-                // The manager is not trusted any more already: what it says next decides.
+                // The watch has lost its trust in the manager again; the manager's next message decides.
                 Some(ClaimStatus::Unheard(_)) => {}
                 _ => goal.stop(StopCause::LeaseEnded("it ended while the resource manager was not heard".to_owned())),
             }

@@ -22,7 +22,7 @@ use tokio::sync::{broadcast, watch};
 use tonic::{Request, Response, Status, Streaming};
 
 impl ActionServer {
-    /// For [`crate::server::Services::with`].
+    /// The gRPC service, for [`crate::server::Services::with`].
     pub fn into_service(self) -> ActionServiceServer<ActionServer> {
         ActionServiceServer::new(self)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
@@ -31,7 +31,7 @@ impl ActionServer {
 }
 
 impl ActionServer {
-    /// A goal that a caller gives, or asks for again.
+    /// A goal that a caller gives, or asks about again.
     pub(super) async fn given(&self, caller: &Caller, request: v1::ExecuteRequest) -> Result<Messages, Status> {
         let known_only = request.known_only;
         let inputs = Fingerprint::of(request.goal.as_ref());
@@ -85,7 +85,7 @@ impl ActionService for ActionServer {
     }
 }
 
-/// What a provider of this resource, name and kind says of itself.
+/// The description of a provider with this resource, name and kind.
 pub(super) fn described(
     resource: &str,
     (provider, kind): (&str, &str),
@@ -105,7 +105,7 @@ pub(super) fn described(
     }
 }
 
-/// What one client hears of a goal. Dropping it is how a client leaves.
+/// The messages that one client gets of a goal. A client leaves by dropping this.
 pub(super) struct Messages {
     accepted: Option<bool>,
     over: bool,
@@ -163,7 +163,7 @@ impl Messages {
                     Err(_) => return None,
                 },
             };
-            // A last word may have come between the two looks.
+            // A last progress report may have come between the two checks.
             if let Ok(progress) = self.progress.try_recv() {
                 return Some(Ok(Kind::Progress(progress)));
             }

@@ -38,7 +38,7 @@ pub enum SignatureError {
         port: String,
         /// Its type.
         expected: Type,
-        /// What it is.
+        /// The type of the value.
         found: &'static str,
     },
     /// An input that the action does not have.
@@ -60,7 +60,7 @@ pub enum SignatureError {
         port: String,
         /// Its type.
         expected: Type,
-        /// What it is.
+        /// The type of the value.
         found: &'static str,
     },
 }
@@ -71,8 +71,8 @@ impl Signature {
         Signature::default()
     }
 
-    /// That of an action of the bundled system which resources of this kind perform, as its catalogue (`deploy/catalogue.toml`) says it; `None`
-    /// for one that is not there.
+    /// The signature of an action that resources of this kind perform in the bundled system, from its catalogue (`deploy/catalogue.toml`);
+    /// `None` if the catalogue has no such action.
     pub fn bundled(kind: &str, action: &str) -> Option<Signature> {
         static STANDARD: LazyLock<Catalogue> = LazyLock::new(Catalogue::standard);
         let provider = STANDARD.providers.values().find(|provider| provider.resource == kind)?;
@@ -116,15 +116,16 @@ impl Signature {
         self
     }
 
-    /// The action reads its projection and changes nothing. This and what the following say is true of every state with this action that
-    /// says nothing else itself. Texts are expressions of task files: `$port` is what the state gives an input, a bare word in an effect an output.
+    /// The action reads its projection and changes nothing. This annotation and the following ones hold for every state with this action,
+    /// unless the state itself says otherwise. Texts are expressions of task files: `$port` is the value that the state gives an input, a
+    /// bare word in an effect is an output.
     #[must_use]
     pub fn computes(mut self) -> Signature {
         self.said.annotations.computes = true;
         self
     }
 
-    /// The action reads the facts of this pattern, for example `at(?)`, and no others than those said so.
+    /// The action reads the facts of this pattern, for example `at(?)`, and no facts beyond the patterns named this way.
     #[must_use]
     pub fn reads(mut self, pattern: &str) -> Signature {
         self.said.annotations.reads.get_or_insert_default().push(pattern.to_owned());
@@ -152,7 +153,7 @@ impl Signature {
         self
     }
 
-    /// The action has this effect with success, for example `not hand_empty(gripper)`, and no others than those said so.
+    /// The action has this effect on success, for example `not hand_empty(gripper)`, and no effects beyond those named this way.
     #[must_use]
     pub fn effect(mut self, effect: &str) -> Signature {
         self.said.annotations.effects.get_or_insert_default().push(effect.to_owned());
@@ -166,7 +167,7 @@ impl Signature {
         self
     }
 
-    /// The action blocks one of this kind of resource; the worker's own kind has to be said, too.
+    /// The action blocks one resource of this kind; the worker's own kind has to be named, too.
     #[must_use]
     pub fn blocks(mut self, kind: &str) -> Signature {
         self.said.annotations.resources.push(kind.to_owned());
@@ -180,15 +181,16 @@ impl Signature {
         self
     }
 
-    /// The action gives a result that can be used, and better ones later, where its goal may ([`super::GoalContext::improved`]). Any of them
-    /// will do: what uses one comes to the same with a better one. Only for what computes or senses.
+    /// The action is an anytime algorithm: it gives a first result and better ones later, if its goal allows that
+    /// ([`super::GoalContext::improved`]). A task must have the same meaning with any of the results. Only for actions that compute or
+    /// sense.
     #[must_use]
     pub fn anytime(mut self) -> Signature {
         self.said.annotations.anytime = true;
         self
     }
 
-    /// Whether every default is of its port's type.
+    /// Checks that every default is of its port's type.
     ///
     /// # Errors
     /// [`DescriptionError::Default`] of the first that is not.
@@ -201,7 +203,7 @@ impl Signature {
         self.defaults.iter().find_map(wrong).map_or(Ok(()), Err)
     }
 
-    /// The signature as a catalogue has it.
+    /// The signature in the form of a catalogue.
     pub fn said(&self) -> &ActionSignature {
         &self.said
     }

@@ -1,4 +1,4 @@
-//! Executes over a client's stream, each as if it had come alone, but that nothing says that it was accepted.
+//! Many goals over one stream of a client. Each is treated as if it had come alone, but there is no message that a goal was accepted.
 
 use super::ActionServer;
 use super::service::Messages;
@@ -15,7 +15,7 @@ use ratn_proto::v1::perform_response::Kind;
 use tonic::Status;
 use tracing::Instrument;
 
-/// What takes the goals of one caller.
+/// Takes the goals of one caller.
 #[derive(Debug)]
 pub struct CallerGoals {
     pub(super) server: ActionServer,
@@ -54,12 +54,12 @@ async fn admitted(server: ActionServer, caller: Caller, execute: ExecuteRequest)
     server.given(&caller, execute).await
 }
 
-/// What a client hears of a goal, its end as the last.
+/// The messages to a client about a goal, the goal's end as the last.
 fn told(messages: Messages) -> impl futures::Stream<Item = Result<Kind, Status>> + Send + 'static {
     unfold(messages, async |mut messages| {
         loop {
             let kind = match messages.next().await? {
-                // That it goes on is no news.
+                // On this stream the acceptance of a goal is not reported.
                 Ok(Heard::Accepted(_)) => continue,
                 Ok(Heard::Progress(progress)) => Ok(Kind::Progress(progress)),
                 Ok(Heard::Improved(better)) => Ok(Kind::Improved(better)),

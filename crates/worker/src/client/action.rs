@@ -29,25 +29,25 @@ pub struct ActionClient {
 pub struct ProviderInfo {
     /// The id of its resource; empty for none.
     pub resource: String,
-    /// In the order of names.
+    /// Sorted by name.
     pub actions: Vec<ActionInfo>,
 }
 
-/// What a goal says before its end.
+/// A message of a goal before its end.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Said {
-    /// How far it is.
+    /// A progress report.
     Progress {
         /// For people and for the event log.
         message: String,
-        /// Figures to it.
+        /// Named values beside the message.
         values: BTreeMap<String, Value>,
     },
-    /// It has a result that can be used, and goes on for a better one.
+    /// An intermediate result that can be used; the goal goes on for a better one.
     Improved(GoalImproved),
 }
 
-/// How a goal ended that was given before.
+/// How a goal ended that was given earlier.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fate {
     /// How it ended.
@@ -63,7 +63,7 @@ pub struct ActionInfo {
     pub name: String,
     /// What it does, for people.
     pub description: String,
-    /// A goal ends when nobody listens to it any more.
+    /// Whether a goal is stopped when its last listener has gone.
     pub cancel_when_abandoned: bool,
 }
 
@@ -104,8 +104,8 @@ impl ActionClient {
         Box::pin(self.execute_hearing(endpoint, goal, || true, only_progress(on_progress))).await
     }
 
-    /// As [`ActionClient::execute`], hearing also the results that a goal gives before its end. Once it is not `wanted` any more it is not
-    /// given again.
+    /// As [`ActionClient::execute`], with the intermediate results that a goal gives before its end. When `wanted` returns false, the goal
+    /// is not given again.
     ///
     /// # Errors
     /// As [`ActionClient::execute`].
@@ -120,7 +120,7 @@ impl ActionClient {
         let mut tries = 1;
         loop {
             match self.listen(endpoint, question.clone(), &mut on_said).await {
-                // It has begun nothing.
+                // The provider has begun nothing.
                 Err(error) if error.is_unconfirmed() && tries < TRIES => {
                     tokio::time::sleep(PAUSE).await;
                     if !wanted() {
@@ -133,11 +133,11 @@ impl ActionClient {
         }
     }
 
-    /// Waits for the end of a goal that was given before, by this client or by an earlier one. Never begins the goal.
+    /// Waits for the end of a goal that was given earlier, by this client or by another. Never begins the goal.
     ///
     /// # Errors
-    /// As [`ActionClient::execute`]; [`CallError::Refused`] with `NotFound` when the provider does not know the goal: it was
-    /// never given, or the provider has been restarted, or has performed many others since.
+    /// As [`ActionClient::execute`]; [`CallError::Refused`] with `NotFound` if the provider does not know the goal: it was never given, the
+    /// provider has been restarted, or the goal has been forgotten: with its lease or, without a lease, after many later goals.
     pub async fn attach(
         &self,
         endpoint: &Endpoint,
@@ -147,7 +147,7 @@ impl ActionClient {
         Box::pin(self.attach_hearing(endpoint, goal, only_progress(on_progress))).await
     }
 
-    /// As [`ActionClient::attach`], hearing also the results that a goal gives from now on before its end.
+    /// As [`ActionClient::attach`], with the intermediate results that a goal gives from now on before its end.
     ///
     /// # Errors
     /// As [`ActionClient::attach`].
@@ -160,7 +160,7 @@ impl ActionClient {
         self.listen(endpoint, v1::ExecuteRequest { goal: Some(goal.into()), known_only: true }, on_said).await
     }
 
-    /// As [`ActionClient::attach_hearing`], over a stream that no other goal shares: what others answer does not break it.
+    /// As [`ActionClient::attach_hearing`], over a stream that no other goal shares: an answer about another goal cannot break it.
     ///
     /// # Errors
     /// As [`ActionClient::attach`].
@@ -212,7 +212,7 @@ impl ActionClient {
             let open = |questions| async move { client.perform(questions).await };
             let stream = self.channels.goals(endpoint);
             match stream.call_with_progress(open, Asked::Execute(question.clone()), &mut heard).await {
-                // Its author has implemented only what is needed for one goal.
+                // The provider implements only the call for a single goal.
                 Err(status) if status.code() == Code::Unimplemented => {
                     Box::pin(self.execute_alone(endpoint, question, heard)).await
                 }
@@ -230,7 +230,7 @@ impl ActionClient {
         Ok(Fate { outcome: result.try_into().map_err(malformed)?, orphaned })
     }
 
-    /// A goal over a stream of its own.
+    /// Executes a goal over a stream of its own.
     async fn execute_alone(
         &self,
         endpoint: &Endpoint,
@@ -250,7 +250,7 @@ impl ActionClient {
         Err(Status::unavailable("the stream ended without the goal's result"))
     }
 
-    /// Tells a goal to stop. False where it was not under way. The outcome is returned by [`ActionClient::execute`].
+    /// Tells a goal to stop. False if it was not under way. [`ActionClient::execute`] returns the outcome.
     ///
     /// # Errors
     /// [`CallError`].
@@ -275,7 +275,7 @@ impl ActionClient {
         Ok(ProviderInfo { resource: answer.resource_id, actions: answer.actions.into_iter().map(info).collect() })
     }
 
-    /// The description of a worker, with the signatures of its actions; waits for `within` at the most.
+    /// The description of a worker, with the signatures of its actions. Waits at most `within`.
     ///
     /// # Errors
     /// [`DescribeError`].
@@ -285,7 +285,7 @@ impl ActionClient {
         let answer = tokio::time::timeout(within, client.describe(v1::DescribeRequest {})).await;
         let late = |_| DescribeError::Unanswered(format!("no answer within {:.1} s", within.as_secs_f64()));
         let answer = answer.map_err(late)?.map_err(|status| match status.code() {
-            // The decoder says so.
+            // The decoder reports this code when the size limit is exceeded.
             Code::OutOfRange => DescribeError::Refused(format!("it has more than {MAX_DESCRIPTION_BYTES} bytes")),
             _ => DescribeError::Unanswered(chain(&CallError::from_status(endpoint, &status))),
         })?;
@@ -299,7 +299,7 @@ impl ActionClient {
     }
 }
 
-/// Hears how far a goal is, and nothing else.
+/// A listener for progress reports alone.
 fn only_progress(mut on_progress: impl FnMut(String, BTreeMap<String, Value>)) -> impl FnMut(Said) {
     move |said| {
         if let Said::Progress { message, values } = said {

@@ -9,12 +9,12 @@ use std::time::Duration;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
 
-/// A server that asks to come again is asked after at least this long, and
+/// Minimum delay before a server that asks the client to retry is asked again, and
 const SOONEST: Duration = Duration::from_millis(10);
-/// at the most this long.
+/// the maximum delay.
 const LATEST: Duration = Duration::from_secs(5);
 
-/// What the error of prost begins with.
+/// How an error message of prost begins.
 const NO_MESSAGE: &str = "failed to decode Protobuf message";
 
 /// Why a call failed.
@@ -23,15 +23,15 @@ pub enum CallError {
     /// Nobody answered: the process died, the connection broke, or nothing listens there.
     #[error("{endpoint} does not answer: {reason}")]
     Broken {
-        /// Who was asked.
+        /// The server.
         endpoint: Endpoint,
-        /// What is known of it.
+        /// The reason, as far as it is known.
         reason: String,
     },
     /// The server refused.
     #[error("{message}")]
     Refused {
-        /// Who was asked.
+        /// The server.
         endpoint: Endpoint,
         /// The gRPC status code.
         code: Code,
@@ -39,13 +39,13 @@ pub enum CallError {
         reason: String,
         /// The server's message.
         message: String,
-        /// Where it refused for load: after so long it may be asked again, as its `google.rpc.RetryInfo` says.
+        /// If the server refused because of load: the delay after which the call may be made again, from its `google.rpc.RetryInfo`.
         retry_after: Option<Duration>,
     },
     /// The answer cannot be read.
     #[error("{endpoint} answered nonsense")]
     Malformed {
-        /// Who was asked.
+        /// The server.
         endpoint: Endpoint,
         /// What is wrong with the answer.
         #[source]
@@ -59,7 +59,7 @@ impl CallError {
         !matches!(self, CallError::Refused { .. })
     }
 
-    /// Whether something came that cannot be read: it is no message, too long, or means nothing. The next time it would be the same.
+    /// Whether the answer cannot be read: it is not a message, too long, or has no meaning. A retry would give the same.
     pub fn is_unreadable(&self) -> bool {
         match self {
             CallError::Malformed { .. } => true,
@@ -84,8 +84,8 @@ impl CallError {
         }
     }
 
-    /// After how long the call may be made again: one that was not answered, or that the server refused for load (RESOURCE_EXHAUSTED with when to
-    /// ask again). `None` for every other refusal, and for an answer that cannot be read.
+    /// The delay after which the call may be made again: if it was not answered, or if the server refused it because of load
+    /// (RESOURCE_EXHAUSTED with a retry delay). `None` for every other refusal, and for an answer that cannot be read.
     pub fn again_after(&self) -> Option<Duration> {
         match self {
             CallError::Refused { retry_after, .. } => *retry_after,
@@ -94,15 +94,15 @@ impl CallError {
         }
     }
 
-    /// What a status that `endpoint` answered (or that stands for its silence) means.
+    /// The error for a status that `endpoint` answered (or that stands for its silence).
     pub fn from_status(endpoint: &Endpoint, status: &Status) -> CallError {
         let endpoint = endpoint.clone();
         let refused = match status.code() {
-            // A provider that has begun nothing, for now.
+            // A refusal: the provider begins nothing for now.
             Code::Unavailable if begins_nothing_yet(status) => true,
-            // The servers of this system use none of these to say no: they come from the connection.
+            // Servers of this system do not refuse with any of these codes: they come from the connection.
             Code::Unavailable | Code::Unknown | Code::Internal | Code::Cancelled | Code::DataLoss => false,
-            // With a source, the status was made on this side.
+            // A status with a source was made on this side.
             _ => status.source().is_none(),
         };
         if refused {
@@ -121,8 +121,8 @@ impl CallError {
         CallError::Broken { endpoint, reason }
     }
 
-    /// Whether a provider refused a goal for now, because it does not hear the resource manager, which confirms leases, or because too
-    /// many goals wait: it has begun nothing, and the goal may be given again.
+    /// Whether a provider refused a goal temporarily, because it does not hear the resource manager, which confirms leases, or because too
+    /// many goals wait. The provider has begun nothing, and the goal may be given again.
     pub fn is_unconfirmed(&self) -> bool {
         self.code() == Some(Code::Unavailable)
     }
@@ -137,7 +137,7 @@ fn begins_nothing_yet(status: &Status) -> bool {
     reason.is_some_and(|reason| [MANAGER_UNHEARD, NOT_AT_REST, TOO_MANY_WAITING].contains(&reason.as_str()))
 }
 
-/// What to do where a connection failed for TLS, as far as its error tells (those of rustls and h2).
+/// Advice for a connection that failed because of TLS, as far as the error (of rustls or h2) tells the cause.
 fn about_tls(endpoint: &Endpoint, reason: &str) -> &'static str {
     match endpoint {
         Endpoint::Tls { .. } if reason.contains("UnknownIssuer") => {

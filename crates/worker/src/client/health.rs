@@ -1,4 +1,4 @@
-//! Asking gRPC health.
+//! A client of the gRPC health service.
 
 use super::CallError;
 use crate::endpoint::{Endpoint, connect_to_ask};
@@ -9,13 +9,13 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-/// The pause between two questions; grows up to the second.
+/// Pause between two health checks; it grows from the first value to the second.
 const POLL_INTERVALS: (Duration, Duration) = (Duration::from_millis(2), Duration::from_millis(50));
 
-/// What [`Health::serving`] says of a server that answers, and not with SERVING.
+/// Error text of [`Health::serving`] for a server that answers, but not with SERVING.
 pub const NOT_SERVING: &str = "its health is not SERVING";
 
-/// Asks one server, over one connection for as long as that holds.
+/// Checks one server's health, over one connection as long as that lasts.
 #[derive(Debug, Clone)]
 pub struct Health {
     endpoint: Endpoint,
@@ -24,15 +24,15 @@ pub struct Health {
 }
 
 impl Health {
-    /// Of the server at `endpoint`, which need not be there yet.
+    /// A client for the server at `endpoint`, which need not be there yet.
     pub fn of(endpoint: Endpoint, tls: &ClientTls) -> Health {
         Health { endpoint, tls: tls.clone(), client: None }
     }
 
-    /// Returns once it says SERVING.
+    /// Returns when the server answers SERVING.
     ///
     /// # Errors
-    /// [`CallError::Broken`] with the last answer when it has not within `deadline`.
+    /// [`CallError::Broken`] with the last answer if the server has not answered so within `deadline`.
     pub async fn serving(&mut self, deadline: Duration) -> Result<(), CallError> {
         let mut last = "no answer yet".to_owned();
         let asked = tokio::time::timeout(deadline, async {
@@ -57,7 +57,7 @@ impl Health {
         })
     }
 
-    /// Whether it says SERVING now.
+    /// Whether the server answers SERVING now.
     ///
     /// # Errors
     /// Why there is no answer within `deadline`.
@@ -80,10 +80,10 @@ impl Health {
     }
 }
 
-/// Returns once the server at `endpoint` says SERVING.
+/// Returns when the server at `endpoint` answers SERVING.
 ///
 /// # Errors
-/// [`CallError::Broken`] with the last answer when it has not within `deadline`.
+/// [`CallError::Broken`] with the last answer if the server has not answered so within `deadline`.
 pub async fn wait_until_serving(endpoint: &Endpoint, tls: &ClientTls, deadline: Duration) -> Result<(), CallError> {
     Health::of(endpoint.clone(), tls).serving(deadline).await
 }

@@ -30,14 +30,14 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// So many channels are kept; beyond it all are forgotten and made anew as they are needed.
+/// Maximum number of cached channels; beyond it all are dropped and connected again on demand.
 const MAX_CHANNELS: usize = 256;
 
-/// So many streams of goals are kept; beyond it those that are not used are forgotten.
+/// Maximum number of cached goal streams; beyond it the unused ones are dropped.
 const MAX_STREAMS: usize = 256;
 
-/// One channel per endpoint, and one stream of goals, shared by all clients that are made of it. A channel connects by itself, again if it
-/// broke. A handle: clones share everything.
+/// One channel and one stream of goals per endpoint, shared by all clients made with this handle. A channel connects on demand, and again
+/// after it broke. A handle: clones share everything.
 #[derive(Debug, Clone)]
 pub struct Channels {
     tls: ClientTls,
@@ -49,7 +49,7 @@ pub struct Channels {
 type Kept = Arc<Mutex<BTreeMap<Endpoint, Traced>>>;
 
 impl Channels {
-    /// No channels yet. Channels to `https://` endpoints trust and show the certificates of `tls`, as they are when a channel connects.
+    /// An empty cache. Channels to `https://` endpoints use the certificates of `tls` as they are at the time of connecting.
     pub fn new(tls: &ClientTls) -> Channels {
         Channels { tls: tls.clone(), kept: Arc::default(), providers: Arc::default(), goals: Arc::default() }
     }
@@ -57,13 +57,13 @@ impl Channels {
     /// The channel to the daemon at `endpoint`. Its calls carry the trace of the tokio task that makes them, and the protocol version. Needs a tokio runtime.
     ///
     /// # Errors
-    /// [`CallError::Broken`] when the endpoint makes no URI.
+    /// [`CallError::Broken`] if the endpoint makes no URI.
     pub fn get(&self, endpoint: &Endpoint) -> Result<Traced, CallError> {
         self.kept_or_made(&self.kept, endpoint, Watched::ByPings)
     }
 
-    /// As [`Channels::get`], to a provider, which may be written in any language: it is not pinged, for
-    /// servers of other libraries take pings for abuse.
+    /// As [`Channels::get`], to a provider. A provider may be written in any language, so it is not pinged: servers of other gRPC libraries
+    /// treat pings as abuse.
     ///
     /// # Errors
     /// As [`Channels::get`].
@@ -85,7 +85,7 @@ impl Channels {
         Ok(channel)
     }
 
-    /// The stream of the goals that are given to the provider at `endpoint`.
+    /// The stream for goals of the provider at `endpoint`.
     fn goals(&self, endpoint: &Endpoint) -> Multiplexer<GoalCalls> {
         let mut streams = self.goals.lock().unwrap_or_else(PoisonError::into_inner);
         if streams.len() >= MAX_STREAMS {
@@ -102,7 +102,7 @@ impl Channels {
     }
 }
 
-/// An id that nobody else has: for requests, sessions and goals.
+/// A unique id for requests, sessions and goals.
 pub fn fresh_id(prefix: &str) -> String {
     static COUNTER: AtomicU64 = AtomicU64::new(0);
     #[expect(clippy::disallowed_methods, reason = "only has to differ from other processes of the same number")]

@@ -1,12 +1,12 @@
-//! Facts and patterns as they are typed: `at(box_1)`, `on(?, table)`, `full(2)`. A name with a comma, a parenthesis or a space goes into
-//! quotes, and so does a number that is a name.
+//! Parses facts and patterns as users type them: `at(box_1)`, `on(?, table)`, `full(2)`. A name with a comma, a parenthesis or a space has
+//! to be quoted, and so does a name that looks like a number.
 
 use ratn_model::fact::{FactKey, FactPattern, Term};
 
-/// Reads a pattern.
+/// Parses a pattern.
 ///
 /// # Errors
-/// What is expected instead.
+/// The syntax that was expected.
 pub fn pattern(text: &str) -> Result<FactPattern, String> {
     let wrong = || format!("`{text}` is no pattern: expected `predicate(argument, ?)`");
     let (predicate, rest) = text.trim().split_once('(').ok_or_else(wrong)?;
@@ -39,10 +39,10 @@ pub fn pattern(text: &str) -> Result<FactPattern, String> {
     Ok(FactPattern { predicate, arguments })
 }
 
-/// Reads a pattern that matches one fact only.
+/// Parses a pattern without `?`: a fact's key.
 ///
 /// # Errors
-/// What is expected instead.
+/// The syntax that was expected.
 pub fn fact(text: &str) -> Result<FactKey, String> {
     let FactPattern { predicate, arguments } = pattern(text)?;
     let arguments: Option<Vec<Term>> = arguments.into_iter().collect();
@@ -50,7 +50,7 @@ pub fn fact(text: &str) -> Result<FactKey, String> {
     Ok(FactKey { predicate, arguments })
 }
 
-/// An argument without quotes.
+/// Parses an argument without quotes.
 fn argument(text: &str) -> Option<Option<Term>> {
     match text {
         "?" => Some(None),

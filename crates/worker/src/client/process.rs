@@ -9,21 +9,21 @@ use ratn_proto::v1;
 use ratn_proto::v1::process_service_client::ProcessServiceClient;
 use tonic::Streaming;
 
-/// Asks one process manager.
+/// A client of one process manager.
 #[derive(Debug, Clone)]
 pub struct ProcessClient {
     endpoint: Endpoint,
     client: ProcessServiceClient<Traced>,
 }
 
-/// Every worker as it is, then every change.
+/// A watch of the workers: first the status of every worker, then every change.
 #[derive(Debug)]
 pub struct WorkerWatch {
     endpoint: Endpoint,
     stream: Streaming<v1::ProcessServiceWatchResponse>,
 }
 
-/// A log, piece by piece.
+/// A worker's log, chunk by chunk.
 #[derive(Debug)]
 pub struct LogPieces {
     endpoint: Endpoint,
@@ -50,7 +50,7 @@ impl ProcessClient {
         answer.try_into().map_err(|m| CallError::malformed(&self.endpoint, m))
     }
 
-    /// Starts `count` workers of a template; their ids.
+    /// Starts `count` workers of a template; returns their ids.
     ///
     /// # Errors
     /// [`CallError`].
@@ -70,7 +70,7 @@ impl ProcessClient {
         Ok(())
     }
 
-    /// Replaces the workers of a template, each once its successor is ready; the ids of those that will go.
+    /// Replaces the workers of a template, each once its successor is ready; returns the ids of the workers to be replaced.
     ///
     /// # Errors
     /// [`CallError`].
@@ -78,7 +78,7 @@ impl ProcessClient {
         self.restart(v1::restart_request::Target::Template(template.to_owned())).await
     }
 
-    /// Replaces a worker once its successor is ready; the ids of those that will go.
+    /// Replaces a worker once its successor is ready; returns the ids of the workers to be replaced.
     ///
     /// # Errors
     /// [`CallError`].
@@ -92,7 +92,7 @@ impl ProcessClient {
         Ok(answer.into_inner().worker_ids)
     }
 
-    /// Changes how many workers a template has; the pool as it is then.
+    /// Changes the number of workers of a template; returns the pool's new status.
     ///
     /// # Errors
     /// [`CallError`].
@@ -103,7 +103,7 @@ impl ProcessClient {
         required(answer.into_inner().pool, "pool").map_err(|m| CallError::malformed(&self.endpoint, m))
     }
 
-    /// The host takes no new work, or does again; the ids of the workers that are still there.
+    /// Starts draining the host (it takes no new work), or ends that; returns the ids of the workers that are still there.
     ///
     /// # Errors
     /// [`CallError`].
@@ -113,7 +113,7 @@ impl ProcessClient {
         Ok(answer.into_inner().worker_ids)
     }
 
-    /// What a worker has written, and with `follow` what it goes on to write until it ends.
+    /// The output of a worker so far; with `follow` also later output until the worker ends.
     ///
     /// # Errors
     /// [`CallError`].
@@ -124,7 +124,7 @@ impl ProcessClient {
         Ok(LogPieces { endpoint: self.endpoint.clone(), stream })
     }
 
-    /// Tells of every worker and every change.
+    /// Watches every worker.
     ///
     /// # Errors
     /// [`CallError`].
@@ -143,7 +143,7 @@ impl WorkerWatch {
     /// The next change; `None` when the manager ends the watch.
     ///
     /// # Errors
-    /// [`CallError`] when it broke.
+    /// [`CallError`] if the watch broke.
     pub async fn next(&mut self) -> Result<Option<WorkerStatus>, CallError> {
         let message = self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))?;
         let Some(message) = message else { return Ok(None) };
@@ -153,10 +153,10 @@ impl WorkerWatch {
 }
 
 impl LogPieces {
-    /// The next bytes; `None` at its end.
+    /// The next chunk; `None` at the end of the log.
     ///
     /// # Errors
-    /// [`CallError`] when it broke.
+    /// [`CallError`] if the stream broke.
     pub async fn next(&mut self) -> Result<Option<Vec<u8>>, CallError> {
         let message = self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))?;
         Ok(message.map(|message| message.chunk))

@@ -1,4 +1,4 @@
-//! The client of the resource manager. The calls that a task makes all the time (acquire, block, release) share one stream per session.
+//! The client of the resource manager. The frequent calls of a task (acquire, block, release) share one stream per session.
 
 use super::unheard::{Ended, Unheard};
 use super::{CallError, Channels, fresh_id, snapshot};
@@ -22,7 +22,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 use tonic::Streaming;
 
-/// Asks one resource manager, in the name of one session. Every mutation gets a fresh request id.
+/// A client of one resource manager, in the name of one session. Every mutation gets a fresh request id.
 #[derive(Debug, Clone)]
 pub struct ResourceClient {
     endpoint: Endpoint,
@@ -35,15 +35,16 @@ pub struct ResourceClient {
 /// How an acquire waits in the queue.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AcquireOptions {
-    /// The request id, which makes a repetition harmless, for example `run/instance/attempt`. A fresh one where empty.
+    /// The request id, which makes the request idempotent, for example `run/instance/attempt`. If empty, a fresh one is used.
     pub request: String,
-    /// Larger priorities are served first, of what was asked within the same ten seconds; equal ones in the order in which they came.
+    /// Among requests made within the same ten seconds, larger priorities are served first; equal priorities in order of arrival.
     pub priority: i64,
-    /// It may turn out not to be needed: all that is needed for certain comes first.
+    /// The resources may turn out not to be needed: requests that are certainly needed come first.
     pub speculative: bool,
-    /// The request id of an earlier acquire of the session for the same, whose place this one takes; empty for none.
+    /// The request id of an earlier acquire of the same session for the same resources, whose place in the queue this one takes; empty for
+    /// none.
     pub instead_of: String,
-    /// The longest time to wait.
+    /// Maximum time to wait.
     pub deadline: Duration,
     /// A name of the holder for people: `sort_boxes: place[2]/plan`.
     pub holder: String,
@@ -62,14 +63,14 @@ impl Default for AcquireOptions {
     }
 }
 
-/// A running watch of the resources that are missing.
+/// A running watch of demand: the resources that are missing.
 #[derive(Debug)]
 pub struct DemandWatch {
     endpoint: Endpoint,
     stream: Streaming<v1::WatchDemandResponse>,
 }
 
-/// The resources as they are, then every change.
+/// A watch of the resources: first a snapshot, then every change.
 #[derive(Debug)]
 pub struct ResourceWatch {
     endpoint: Endpoint,
@@ -77,8 +78,8 @@ pub struct ResourceWatch {
 }
 
 impl ResourceClient {
-    /// The client of the resource manager at `endpoint`. `session` is that of a [`crate::session::Session`]; who only
-    /// lists and watches needs none.
+    /// The client of the resource manager at `endpoint`. `session` is the id of a [`crate::session::Session`]; it may be empty for a client
+    /// that only lists and watches.
     ///
     /// # Errors
     /// As [`Channels::get`].
@@ -90,7 +91,7 @@ impl ResourceClient {
         Ok(ResourceClient { endpoint, session, client, calls: Multiplexer::default(), unheard: Unheard::default() })
     }
 
-    /// Where the resource manager is.
+    /// The resource manager's endpoint.
     pub fn endpoint(&self) -> &Endpoint {
         &self.endpoint
     }
@@ -103,7 +104,7 @@ impl ResourceClient {
         self.create_once("", resource).await
     }
 
-    /// As [`ResourceClient::create`], once however often it is asked for with this request id.
+    /// As [`ResourceClient::create`], idempotent by this request id.
     ///
     /// # Errors
     /// [`CallError`].
@@ -114,7 +115,7 @@ impl ResourceClient {
         self.field(answer.into_inner().resource, "resource")
     }
 
-    /// Consumes capacity. Returns the ids of the resources that it was taken from.
+    /// Consumes capacity. Returns the ids of the resources from which it was taken.
     ///
     /// # Errors
     /// [`CallError`].
@@ -122,7 +123,7 @@ impl ResourceClient {
         self.consume_once("", requirement).await
     }
 
-    /// As [`ResourceClient::consume`], once however often it is asked for with this request id.
+    /// As [`ResourceClient::consume`], idempotent by this request id.
     ///
     /// # Errors
     /// [`CallError`].
@@ -141,7 +142,7 @@ impl ResourceClient {
         self.delete_target("", v1::delete_request::Target::ResourceId(resource.to_owned())).await.map(|_| ())
     }
 
-    /// Removes as many resources as the requirement says. Returns their ids.
+    /// Removes as many resources as the requirement demands. Returns their ids.
     ///
     /// # Errors
     /// [`CallError`].
@@ -149,7 +150,7 @@ impl ResourceClient {
         self.delete_matching_once("", requirement).await
     }
 
-    /// As [`ResourceClient::delete_matching`], once however often it is asked for with this request id.
+    /// As [`ResourceClient::delete_matching`], idempotent by this request id.
     ///
     /// # Errors
     /// [`CallError`].
@@ -188,8 +189,8 @@ impl ResourceClient {
         }
     }
 
-    /// Waits until all requirements can be met at once, and takes them under one lease. Dropping the future leaves the queue; a lease that is
-    /// granted at that moment is given back, unless another call of the same request id waits for it or has got it.
+    /// Waits until all requirements can be met at once, and takes the resources under one lease. Dropping the future leaves the queue; a
+    /// lease that is granted at that moment is given back, unless another call of the same request id waits for it or has got it.
     ///
     /// # Errors
     /// [`CallError`].
@@ -197,7 +198,7 @@ impl ResourceClient {
         Ok(self.acquire_with_notes(requirements, options).await?.0)
     }
 
-    /// As [`ResourceClient::acquire`], with what those who gave the resources back last have left to be told.
+    /// As [`ResourceClient::acquire`], with the notes that the last holders left when they released the resources.
     ///
     /// # Errors
     /// [`CallError`].
@@ -223,8 +224,8 @@ impl ResourceClient {
         }
     }
 
-    /// Undoes an acquire or a block by its request id, for every call that made it: the request leaves the queue, or its lease is given back.
-    /// The same request id may be used for another acquire. False when there was nothing to undo.
+    /// Withdraws an acquire or a block by its request id, for every call that made it: the request leaves the queue, or its lease is given
+    /// back. Then the same request id may be used for another acquire. False if there was nothing to withdraw.
     ///
     /// # Errors
     /// [`CallError`].
@@ -240,7 +241,7 @@ impl ResourceClient {
         }
     }
 
-    /// Gives a lease back. False when it had ended before.
+    /// Releases a lease. False if it had ended before.
     ///
     /// # Errors
     /// [`CallError`].
@@ -248,7 +249,7 @@ impl ResourceClient {
         self.release_with_note(lease, String::new()).await
     }
 
-    /// As [`ResourceClient::release`]; whoever gets its resources next is told this, of at most 256 bytes.
+    /// As [`ResourceClient::release`], with a note of at most 256 bytes for the next holder of the resources.
     ///
     /// # Errors
     /// [`CallError`].
@@ -261,14 +262,14 @@ impl ResourceClient {
         }
     }
 
-    /// Says, as the provider of a resource, that nothing moves any more for a lease that has ended; false when the lease had left nothing
-    /// of it.
+    /// Confirms, as the provider of a resource, that nothing moves any more for a lease that has ended. False if no confirmation was
+    /// pending for that lease.
     ///
     /// # Errors
     /// [`CallError`].
     pub async fn confirm_standstill(&self, lease: LeaseId, resource: &str) -> Result<bool, CallError> {
         let question = v1::ConfirmStandstillRequest {
-            // Another confirmation of the same changes nothing.
+            // A repeated confirmation changes nothing.
             request_id: String::new(),
             session_id: self.session.clone(),
             lease_id: lease.0,
@@ -288,7 +289,7 @@ impl ResourceClient {
         Ok(answer.into_inner().exists)
     }
 
-    /// The resources of these kinds (of every kind, when none is named), in the order of ids.
+    /// The resources of these kinds (without kinds: of every kind), sorted by id.
     ///
     /// # Errors
     /// [`CallError`].
@@ -296,7 +297,7 @@ impl ResourceClient {
         self.list_where(ResourceFilter { kinds: owned(kinds), ..ResourceFilter::default() }).await
     }
 
-    /// The resources that pass a filter, in the order of ids.
+    /// The resources that pass a filter, sorted by id.
     ///
     /// # Errors
     /// [`CallError`].
@@ -317,7 +318,7 @@ impl ResourceClient {
     /// One resource.
     ///
     /// # Errors
-    /// [`CallError`], also where it is not there.
+    /// [`CallError`], also if it does not exist.
     pub async fn get(&self, resource: &str) -> Result<Resource, CallError> {
         let question = v1::ResourceServiceGetRequest { resource_id: resource.to_owned() };
         let answer = self.client.clone().get(question).await.map_err(|status| self.failed(&status))?;
@@ -327,14 +328,14 @@ impl ResourceClient {
     /// Why the acquire of a request id waits. With an empty id: why the first hundred acquires of the queue wait.
     ///
     /// # Errors
-    /// [`CallError`], also where the one asked for does not wait.
+    /// [`CallError`], also if the given request does not wait.
     pub async fn explain(&self, request: &str) -> Result<Vec<WaitingAcquire>, CallError> {
         let question = v1::ExplainRequest { request_id: request.to_owned() };
         let answer = self.client.clone().explain(question).await.map_err(|status| self.failed(&status))?;
         each(answer.into_inner().waiting, "waiting").map_err(|m| self.malformed(m))
     }
 
-    /// Every session, in the order of ids.
+    /// Every session, sorted by id.
     ///
     /// # Errors
     /// [`CallError`].
@@ -352,7 +353,7 @@ impl ResourceClient {
         }
     }
 
-    /// The session's task is over: what it consumed of what is renewable returns.
+    /// Ends the session's task: renewable capacity that it consumed is returned.
     ///
     /// # Errors
     /// [`CallError`].
@@ -362,7 +363,7 @@ impl ResourceClient {
         self.client.clone().end_task(question).await.map(drop).map_err(|status| self.failed(&status))
     }
 
-    /// Tells of the resources of these kinds (of every kind, when none is named) and of every change.
+    /// Watches the resources of these kinds (without kinds: of every kind): a snapshot, then every change.
     ///
     /// # Errors
     /// [`CallError`].
@@ -370,11 +371,11 @@ impl ResourceClient {
         self.watch_from(kinds, None).await
     }
 
-    /// Tells of every change after a revision or an event ([`ratn_proto::types::ResourceEvent::position`]), without a snapshot;
-    /// with one, when no position is given.
+    /// Watches every change after a revision or an event ([`ratn_proto::types::ResourceEvent::position`]), without a snapshot; if no
+    /// position is given, with one.
     ///
     /// # Errors
-    /// [`CallError`], also where the changes after it are not all known any more.
+    /// [`CallError`], also if not all changes after the position are kept any more.
     pub async fn watch_from(&self, kinds: &[&str], after: Option<WatchPosition>) -> Result<ResourceWatch, CallError> {
         let after_revision = after.map(|after| after.revision.0);
         let after_part = after.and_then(|after| after.part);
@@ -383,7 +384,7 @@ impl ResourceClient {
         self.watched(question).await
     }
 
-    /// Tells of the resources of these ids, of which there is at least one, and of every change of them.
+    /// Watches the resources of these ids; at least one id must be given.
     ///
     /// # Errors
     /// [`CallError`].
@@ -398,8 +399,8 @@ impl ResourceClient {
         Ok(ResourceWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }
 
-    /// Tells a provider of these kinds, all with these attributes, what is asked of it: what is missing at first, and then whenever that
-    /// changes.
+    /// Watches the demand, for a provider of these kinds whose resources of a kind all have these attributes: the resources that are
+    /// missing, first now, then after every change.
     ///
     /// # Errors
     /// [`CallError`].
@@ -423,8 +424,8 @@ impl ResourceClient {
         Ok(DemandWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }
 
-    /// Says to those who wait for a kind why there are at most so many of it for now; an empty reason takes that back. More than that is
-    /// not asked of this provider.
+    /// Reports, to everybody who waits for a kind, why there are at most `most` of it for now; an empty reason takes the report back. The
+    /// manager asks this provider for no more than that.
     ///
     /// # Errors
     /// [`CallError`].
@@ -434,15 +435,15 @@ impl ResourceClient {
         self.client.clone().report_shortage(question).await.map(drop).map_err(|status| self.failed(&status))
     }
 
-    /// Over the session's stream.
+    /// Asks over the session's stream.
     async fn ask(&self, question: Asked) -> Result<Answered, CallError> {
         let mut client = self.client.clone();
         let open = |questions| async move { client.session(questions).await };
         self.calls.call(open, question).await.map_err(|status| self.failed(&status))
     }
 
-    /// The same, of a question that is answered with a lease. Dropped after the answer to an earlier one of its request was lost, it gives
-    /// back the lease of that.
+    /// As `ask`, for a question that is answered with a lease. If the future is dropped after the answer to an earlier question of the same
+    /// request was lost, the lease of that answer is given back.
     async fn ask_for_lease(&self, request: &str, question: Asked) -> Result<Answered, CallError> {
         let mut client = self.client.clone();
         let open = |questions| async move { client.session(questions).await };
@@ -462,12 +463,12 @@ impl ResourceClient {
         answer
     }
 
-    /// The answer is that of another call.
+    /// The error for an answer that belongs to another kind of call.
     fn another(&self, asked: &str) -> CallError {
         self.malformed(Malformed::new("kind", format!("is not that of an answer to {asked}")))
     }
 
-    /// A request's id, a fresh one where it has none, and the session's.
+    /// The request id (a fresh one if empty) and the session's id.
     fn mutation(&self, request: &str) -> (String, String) {
         let id = if request.is_empty() { fresh_id("request") } else { request.to_owned() };
         (id, self.session.clone())
@@ -487,10 +488,10 @@ impl ResourceClient {
 }
 
 impl DemandWatch {
-    /// What is missing now; `None` when the manager ends the watch.
+    /// The present demand; `None` when the manager ends the watch.
     ///
     /// # Errors
-    /// [`CallError`] when it broke.
+    /// [`CallError`] if the watch broke.
     pub async fn next(&mut self) -> Result<Option<Vec<Demand>>, CallError> {
         let message = self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))?;
         let demands = message.map(|message| each(message.demands, "demands")).transpose();
@@ -502,7 +503,7 @@ impl ResourceWatch {
     /// The snapshot, then every change; `None` when the manager ends the watch.
     ///
     /// # Errors
-    /// [`CallError`] when it broke.
+    /// [`CallError`] if the watch broke.
     pub async fn next(&mut self) -> Result<Option<ResourceUpdate>, CallError> {
         let message = snapshot::next(&self.endpoint, &mut self.stream).await?;
         let update = message.map(ResourceUpdate::try_from).transpose();

@@ -1,18 +1,19 @@
-//! Retries of calls that are idempotent: they only read, or their request id makes the server answer a repetition as before.
+//! Retries of idempotent calls: they only read, or their request id makes the server answer a repetition as it did before.
 //!
-//! [`CallError::again_after`] says what is tried again and when: what was not answered after [`PAUSE`], and what was refused for load when the
-//! server has said to ask again. Every other refusal is an answer. The two functions differ in how long they go on.
+//! [`CallError::again_after`] decides what is retried and when: a call that was not answered after [`PAUSE`], and a call that was refused
+//! because of load when the server says so. Every other refusal is an answer. The two functions differ in how long they retry.
 
 use super::CallError;
 use std::time::{Duration, Instant};
 
-/// The number of tries: for longer than a session lives ([`crate::session::DEFAULT_TTL`]), so that a daemon that is started again in time is reached.
+/// Number of tries. They last longer than a session's time to live ([`crate::session::DEFAULT_TTL`]), so that a daemon that restarts in
+/// time is reached.
 pub(crate) const TRIES: u32 = 16;
-/// The pause between two tries of a call that is not answered.
+/// Pause between two tries of a call that is not answered.
 pub const PAUSE: Duration = Duration::from_millis(250);
 
-/// Repeats a call that was not answered, or was refused for load, up to 16 times: the pauses come to 4 s. A try that hangs adds its own time, which the
-/// connection bounds.
+/// Retries a call that was not answered, or was refused because of load, up to 16 times with pauses of 4 s in total. A try that hangs adds
+/// its own time, which the connection bounds.
 ///
 /// # Errors
 /// The error of the last try.
@@ -29,8 +30,8 @@ where
     call().await
 }
 
-/// Repeats a call for as long as it is not answered, for calls that the caller drops when it gives its session up. One that is refused for load is
-/// repeated for `patience`, counted anew after every try that was not.
+/// Retries a call as long as it is not answered, for calls whose future the caller drops when it gives up its session. A call that is
+/// refused because of load is retried for `patience`, counted anew after every try that failed otherwise.
 ///
 /// # Errors
 /// A refusal.
@@ -47,7 +48,8 @@ where
     }
 }
 
-/// How long a call is made again that is refused for load, counted anew after every try that was not: a bound may stay reached.
+/// How long a call that is refused because of load is retried, counted anew after every try that failed otherwise: a limit may stay
+/// reached.
 #[derive(Debug)]
 pub struct LoadPatience {
     patience: Duration,
@@ -55,12 +57,12 @@ pub struct LoadPatience {
 }
 
 impl LoadPatience {
-    /// For so long.
+    /// A retry policy with this patience.
     pub fn new(patience: Duration) -> LoadPatience {
         LoadPatience { patience, refused_since: None }
     }
 
-    /// As [`CallError::again_after`]; `None` as well where the time is over.
+    /// As [`CallError::again_after`]; `None` also if the patience is exhausted.
     pub fn again_after(&mut self, error: &CallError) -> Option<Duration> {
         let pause = error.again_after()?;
         if error.is_crash() {

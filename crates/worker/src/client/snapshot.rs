@@ -1,4 +1,4 @@
-//! Snapshots that arrive in parts: the first messages of a watch are put together again.
+//! Joins snapshots that arrive in parts, as the first messages of a watch.
 
 use super::CallError;
 use crate::endpoint::Endpoint;
@@ -8,7 +8,7 @@ use tonic::Streaming;
 
 /// A message of a watch.
 pub(super) trait InParts {
-    /// What a snapshot has many of.
+    /// The item type of a snapshot.
     type Item;
 
     /// The items of a snapshot, and whether a further part follows; `None` for any other message.
@@ -35,7 +35,7 @@ impl InParts for v1::WorldPoolServiceWatchResponse {
     }
 }
 
-/// The next message, a snapshot with all its parts; `None` when the stream has ended.
+/// The next message, with all parts of a snapshot joined; `None` at the end of the stream.
 pub(super) async fn next<M: InParts>(endpoint: &Endpoint, stream: &mut Streaming<M>) -> Result<Option<M>, CallError> {
     let failed = |status| CallError::from_status(endpoint, &status);
     let mut message = stream.message().await.map_err(failed)?;

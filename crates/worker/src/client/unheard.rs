@@ -1,16 +1,17 @@
-//! Acquires whose answers may have been lost: whoever asks again and then drops that says so, or a lease that nobody heard of would stay.
+//! Tracks acquires whose answers may have been lost: if the client asks again and then drops the call, it has to tell the manager, or an
+//! unknown lease would stay.
 //!
-//! The resource manager cannot know whether an answer was read. A client does: a request is unheard from the break of a stream on until
-//! one of its questions is granted, or the request is withdrawn. A refusal says nothing of it: what is asked again may be refused before the
-//! manager looks what an earlier question was granted.
+//! The resource manager cannot know whether an answer was read. A client can: a request is unheard from the break of a stream until one of
+//! its questions is granted, or the request is withdrawn. A refusal does not change this: the manager may refuse a repeated question before
+//! it looks up what it granted to an earlier one.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Requests that are remembered without a question under way; whose answer was lost before these is told apart no more.
+/// Maximum number of requests kept without a question under way. The lost answers of further ones are forgotten.
 const MOST: usize = 1_024;
 
-/// By request id. Clones share everything.
+/// Requests by id. Clones share everything.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Unheard(Arc<Mutex<BTreeMap<String, Request>>>);
 
@@ -18,7 +19,7 @@ pub(super) struct Unheard(Arc<Mutex<BTreeMap<String, Request>>>);
 struct Request {
     /// Questions under way.
     under_way: usize,
-    /// No question was granted since the answer to one was lost.
+    /// An answer was lost, and no question has been granted since.
     lost: bool,
 }
 
@@ -39,13 +40,13 @@ pub(super) struct Question {
 }
 
 impl Unheard {
-    /// A question of a request begins.
+    /// Records that a question of a request begins.
     pub(super) fn ask(&self, request: &str) -> Question {
         self.open().entry(request.to_owned()).or_default().under_way += 1;
         Question { unheard: self.clone(), request: request.to_owned() }
     }
 
-    /// The request is undone, whatever was granted to it.
+    /// Records that the request is withdrawn, with everything granted to it.
     pub(super) fn withdrawn(&self, request: &str) {
         let mut requests = self.open();
         let Some(known) = requests.get_mut(request) else { return };
@@ -61,7 +62,7 @@ impl Unheard {
 }
 
 impl Question {
-    /// It was answered, or its answer is lost.
+    /// Records that the question was answered, or its answer lost.
     pub(super) fn ended(&self, ended: Ended) {
         if ended == Ended::Refused {
             return;
@@ -77,7 +78,7 @@ impl Question {
         }
     }
 
-    /// It is dropped; whether that is the end of its request, of which no answer was heard.
+    /// Records that the question was dropped. Returns whether this was the last question of a request whose answer was lost.
     pub(super) fn dropped(&self) -> bool {
         let mut requests = self.unheard.open();
         let Some(request) = requests.get_mut(&self.request).filter(|request| request.under_way == 1) else {

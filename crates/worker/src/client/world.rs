@@ -1,4 +1,4 @@
-//! The client of the world pool. The calls that a task makes all the time (commit, project, release) share one stream per client.
+//! The client of the world pool. The frequent calls of a task (commit, project, release) share one stream per client.
 
 use super::{CallError, Channels, snapshot};
 use crate::endpoint::Endpoint;
@@ -22,60 +22,60 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use tonic::{Code, Status, Streaming};
 use tonic_types::StatusExt;
 
-/// What a stream adds to a call: its id and its place in the trace.
+/// Bytes that the stream adds to a call: its id and its trace context.
 const ENVELOPE_BYTES: usize = 128;
 
-/// Asks one world pool.
+/// A client of one world pool.
 #[derive(Debug, Clone)]
 pub struct WorldClient {
     endpoint: Endpoint,
     client: WorldPoolServiceClient<Traced>,
     calls: Multiplexer<WorldCalls>,
-    /// The pool is of a version that takes every call alone.
+    /// The pool is of an older version, without the stream of calls.
     alone: Arc<AtomicBool>,
 }
 
-/// A projection that is to be made.
+/// A projection to be made.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Projection {
     /// The request id, `run/instance/attempt`: the same request makes one projection.
     pub request: String,
-    /// The revision of the root that the projection stands on.
+    /// The revision of the root that the projection is based on.
     pub base: Revision,
     /// The changes on top of that revision, in order.
     pub changes: Vec<Change>,
-    /// Who will make the change at the same place, by the path of its instance: its commit is compared with what was predicted of
-    /// it. Empty or missing: nobody, and the change stands over whatever is committed.
+    /// For each change the writer that is expected to commit it, by the path of its instance: the pool compares that commit with the
+    /// predicted change. Empty or missing: no writer, and the change stays in effect over every commit.
     pub writers: Vec<Arc<str>>,
-    /// The facts of it that may be seen.
+    /// The facts of the projection that its reader may see.
     pub reads: Footprint,
-    /// The lease that holds the room for it, with its token.
+    /// The lease that holds the resource for the projection, with its fencing token.
     pub lease: Option<(LeaseId, FencingToken)>,
 }
 
-/// What of a projection is known before it is there.
+/// For a projection that is referred to before it exists.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Early {
-    /// Its id, one that an answer has promised; `None`: the pool picks one.
+    /// The projection's id, one that an earlier answer has promised; `None`: the pool chooses one.
     pub id: Option<ProjectionId>,
-    /// A commit that is on its way: the projection stands on what that makes, or on a later revision.
+    /// The id of a commit on its way: the projection is based on the revision that this commit makes, or a later one.
     pub after: Option<String>,
-    /// So many ids the answer is to promise, at most 64.
+    /// Number of ids that the answer is to promise, at most 64.
     pub promise: u32,
 }
 
-/// Changes that are to become real.
+/// Changes to be committed to the root.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Commit {
     /// The commit's id, `run/instance`: the same id commits once.
     pub id: String,
     /// The changes, in order.
     pub changes: Vec<Change>,
-    /// The revision that the root must get by this commit; `None` where that does not matter.
+    /// The revision that the root must get by this commit; `None` for any.
     pub revision: Option<Revision>,
     /// The node that writes, by the path of its instance; may be empty.
     pub writer: String,
-    /// What measured which of the facts that are written.
+    /// Which measurement each written fact comes from.
     pub evidence: Evidence,
 }
 
@@ -94,10 +94,10 @@ pub struct ProjectionWatch {
 }
 
 impl ProjectionWatch {
-    /// Whether it holds at the start, then its first contradiction; `None` when it has ended.
+    /// First whether the projection holds, then its first contradiction; `None` when the projection has ended.
     ///
     /// # Errors
-    /// [`CallError`] when it broke.
+    /// [`CallError`] if the watch broke.
     pub async fn next(&mut self) -> Result<Option<Option<Contradiction>>, CallError> {
         let message = self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))?;
         let told = message.map(|message| message.contradiction.map(Contradiction::try_from).transpose()).transpose();
@@ -109,7 +109,7 @@ impl WorldWatch {
     /// The snapshot, then every revision; `None` when the pool ends the watch.
     ///
     /// # Errors
-    /// [`CallError`] when it broke.
+    /// [`CallError`] if the watch broke.
     pub async fn next(&mut self) -> Result<Option<WorldUpdate>, CallError> {
         let message = snapshot::next(&self.endpoint, &mut self.stream).await?;
         let update = message.map(WorldUpdate::try_from).transpose();
@@ -129,12 +129,12 @@ impl WorldClient {
         Ok(WorldClient { endpoint: endpoint.clone(), client, calls: Multiplexer::default(), alone: Arc::default() })
     }
 
-    /// Where the world pool is.
+    /// The world pool's endpoint.
     pub fn endpoint(&self) -> &Endpoint {
         &self.endpoint
     }
 
-    /// The root's revision and every fact of it.
+    /// The root's revision and all its facts.
     ///
     /// # Errors
     /// [`CallError`].
@@ -142,8 +142,8 @@ impl WorldClient {
         self.all_pages(v1::QueryRequest::default()).await
     }
 
-    /// Makes changes real, and returns the revision of the root with them. `commit` is the commit's id, `run/instance`: the same id commits
-    /// once. `revision` is the revision that the root must get, where that matters.
+    /// Commits changes, and returns the resulting revision of the root. `commit` is the commit's id, `run/instance`: the same id commits
+    /// once. `revision`, if given, is the revision that the root must get.
     ///
     /// # Errors
     /// [`CallError`].
@@ -157,8 +157,8 @@ impl WorldClient {
         self.commit_as(commit).await.map(|(revision, _)| revision)
     }
 
-    /// As [`WorldClient::commit`], with who writes and what measured what is written; and the projections that it contradicts, in the
-    /// order of ids (none where the same was committed before).
+    /// As [`WorldClient::commit`], with the writer and the evidence. Returns also the projections that the commit contradicts, sorted by id
+    /// (none if the same id was committed before).
     ///
     /// # Errors
     /// [`CallError`].
@@ -185,10 +185,11 @@ impl WorldClient {
         self.project_early(projection, Early::default()).await.map(|(id, _)| id)
     }
 
-    /// As [`WorldClient::project`], of one that others were told of already; with the ids that are promised for the next ones.
+    /// As [`WorldClient::project`], for a projection whose id others may know already. Returns also the ids that are promised for the next
+    /// projections.
     ///
     /// # Errors
-    /// [`CallError`]; FAILED_PRECONDITION where the id was not promised, or the commit does not come within a second.
+    /// [`CallError`]; FAILED_PRECONDITION if the id was not promised, or the commit does not come within a second.
     pub async fn project_early(
         &self,
         projection: Projection,
@@ -228,11 +229,11 @@ impl WorldClient {
         self.all_pages(question).await.map(|(_, facts)| facts)
     }
 
-    /// The facts of the root as it was at a revision (as it is, where none is given) that match any of the patterns, all without
-    /// one; and that revision.
+    /// The facts of the root at a revision (by default: the present one) that match any of the patterns (without patterns: all), and that
+    /// revision.
     ///
     /// # Errors
-    /// [`CallError`], also where the revision is not kept any more.
+    /// [`CallError`], also if the revision is not kept any more.
     pub async fn root_at(
         &self,
         revision: Option<Revision>,
@@ -243,11 +244,11 @@ impl WorldClient {
         self.all_pages(v1::QueryRequest { at_revision, patterns, ..Default::default() }).await
     }
 
-    /// Tells of every revision of the root, a snapshot first; with a revision, of every one after it and without a snapshot. With
-    /// patterns only of what matches one.
+    /// Watches the revisions of the root, a snapshot first; with `after`, every revision after that one and no snapshot. With patterns,
+    /// only the facts that match one.
     ///
     /// # Errors
-    /// [`CallError`], also where the revisions after it are not all kept any more.
+    /// [`CallError`], also if not all revisions after `after` are kept any more.
     pub async fn watch(&self, after: Option<Revision>, patterns: &[FactPattern]) -> Result<WorldWatch, CallError> {
         let after_revision = after.map(|after| after.0);
         let patterns = all(patterns.iter().cloned());
@@ -256,10 +257,10 @@ impl WorldClient {
         Ok(WorldWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }
 
-    /// The facts that differ between two revisions of the root, and the second as a number; `None` is the root as it is.
+    /// The facts that differ between two revisions of the root, and the number of the second revision; `None` is the present root.
     ///
     /// # Errors
-    /// [`CallError`], also where one is not kept any more.
+    /// [`CallError`], also if one of them is not kept any more.
     pub async fn diff(
         &self,
         from: Revision,
@@ -283,7 +284,7 @@ impl WorldClient {
         }
     }
 
-    /// What a fact was, the newest first, and the oldest revision that is kept: what was before that is not known.
+    /// The versions of a fact, the newest first, and the oldest revision that is kept: earlier versions are unknown.
     ///
     /// # Errors
     /// [`CallError`].
@@ -295,21 +296,21 @@ impl WorldClient {
         Ok((versions, Revision(answer.oldest_revision)))
     }
 
-    /// Tells whether a projection still holds, and once more when the root first contradicts it.
+    /// Watches whether a projection holds: first its present state, then the first contradiction by the root.
     ///
     /// # Errors
-    /// [`CallError`], also where the projection has ended.
+    /// [`CallError`], also if the projection has ended.
     pub async fn watch_projection(&self, projection: ProjectionId) -> Result<ProjectionWatch, CallError> {
         let question = v1::WatchProjectionRequest { projection_id: projection.0 };
         let answer = self.client.clone().watch_projection(question).await.map_err(|status| self.failed(&status))?;
         Ok(ProjectionWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }
 
-    /// The scene of a projection, or of the root: what it differs by from one of the bases (scenes that the caller has, the likeliest
-    /// first, at most 16), or all of it.
+    /// The scene of a projection, or of the root: the difference from one of the bases (scenes that the caller has, the likeliest first, at
+    /// most 16), or the whole scene.
     ///
     /// # Errors
-    /// [`CallError`], also where a geometric fact makes no geometry.
+    /// [`CallError`], also if a geometric fact yields no geometry.
     pub async fn scene(&self, projection: Option<ProjectionId>, bases: &[Digest]) -> Result<SceneDelta, CallError> {
         let bases = bases.iter().map(|base| base.as_bytes().to_vec()).collect();
         let question = v1::GetSceneRequest { projection_id: projection.map(|projection| projection.0), bases };
@@ -317,7 +318,7 @@ impl WorldClient {
         SceneDelta::try_from(answer.into_inner()).map_err(|m| CallError::malformed(&self.endpoint, m))
     }
 
-    /// Ends a projection; false when it had ended before.
+    /// Ends a projection; false if it had ended before.
     ///
     /// # Errors
     /// [`CallError`].
@@ -329,7 +330,7 @@ impl WorldClient {
         }
     }
 
-    /// Asks over the stream of calls, or over a stream of its own where the pool takes it only so.
+    /// Asks over the stream of calls; with a pool that has no such stream, by a call of its own.
     async fn ask(&self, call: Asked) -> Result<Answered, CallError> {
         self.fits(&call)?;
         if !self.alone.load(Ordering::Relaxed) {
@@ -356,7 +357,7 @@ impl WorldClient {
         }
     }
 
-    /// A message that is too large would end the stream, and every other call on it.
+    /// Checks the size: a message that is too large would end the stream, and every other call on it.
     fn fits(&self, call: &Asked) -> Result<(), CallError> {
         let bytes = call.encoded_len();
         if bytes <= MAX_MESSAGE_BYTES - ENVELOPE_BYTES {
@@ -372,7 +373,7 @@ impl WorldClient {
         CallError::malformed(&self.endpoint, Malformed::new("kind", format!("is not that of an answer to {what}")))
     }
 
-    /// All pages of an answer, which are of one revision.
+    /// All pages of an answer; they belong to one revision.
     async fn all_pages(&self, mut question: v1::QueryRequest) -> Result<(Revision, Vec<FactRecord>), CallError> {
         question.page_bytes = PAGE_BYTES;
         let mut facts = Vec::new();
@@ -396,7 +397,7 @@ impl WorldClient {
     }
 }
 
-/// Whether a pool does not know the stream of calls: its version is of before that.
+/// Whether a pool is of an older version that does not know the stream of calls.
 fn has_no_calls(status: &Status) -> bool {
     let closed = || status.get_details_error_info().is_some_and(|info| info.reason == "METHOD_CLOSED");
     status.code() == Code::Unimplemented || (status.code() == Code::PermissionDenied && closed())

@@ -1,9 +1,9 @@
-//! Accepts connections in a thread of its own: who connects all the time keeps nobody waiting who is connected. Beyond its rate a
-//! connection is told why, and closed, in that thread.
+//! Accepts connections in a thread of its own, so that a client that connects all the time delays no client that is connected. A connection
+//! beyond its origin's rate is told why, and closed, in that thread.
 //!
 //! ```text
 //!   listener ─ within the rate ─▶ queue ─▶ the server's runtime
-//!       └───── beyond ─▶ GOAWAY with the reason (not with TLS, where nothing can be said before a handshake) ─▶ closed
+//!       └───── beyond ─▶ GOAWAY with the reason (not with TLS, where nothing can be sent before a handshake) ─▶ closed
 //! ```
 
 use super::rates::Rates;
@@ -23,19 +23,19 @@ use tokio::net::{TcpListener, TcpStream, UnixListener};
 use tokio::sync::mpsc;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-/// Connections that the server has not taken yet.
+/// Maximum number of accepted connections that the server has not taken yet.
 const QUEUE: usize = 64;
-/// After an error of the system (no more open files) it is tried again.
+/// Pause before the next attempt after a system error (for example: no more open files).
 const AGAIN: Duration = Duration::from_millis(100);
 
-/// A connection that was told why it is closed stays open for so long, so that its client, which speaks first, reads that.
+/// How long a connection that was told why it is closed stays open, so that its client, which speaks first, reads the reason.
 const LINGER: Duration = Duration::from_millis(250);
-/// So many of them at the most.
+/// Maximum number of connections that stay open for that.
 const MOST_TOLD: usize = 64;
 
 /// A listener and its connections.
 pub(crate) trait Listen: Send + Sync + Sized + 'static {
-    /// Without a runtime, on its way from one to another.
+    /// The listener without a runtime, while it moves from one runtime to another.
     type Detached: Send + 'static;
     /// A connection.
     type Stream: Goodbye + Send + 'static;
@@ -47,26 +47,26 @@ pub(crate) trait Listen: Send + Sync + Sized + 'static {
     fn origin(stream: &Self::Stream, identity: &Identity) -> Origin;
 }
 
-/// What can be told why it is closed.
+/// A connection that can be told why it is closed.
 pub(crate) trait Goodbye: Sized {
-    /// Without a runtime, on its way from one to another.
+    /// The connection without a runtime, while it moves from one runtime to another.
     type Detached: Send + 'static;
 
     fn detach(self) -> io::Result<Self::Detached>;
     fn attach(detached: Self::Detached) -> io::Result<Self>;
-    /// What is ready to be read, and as much written as is taken at once.
+    /// Non-blocking: reads what is ready, writes as much as is accepted at once.
     fn try_read(&self, buffer: &mut [u8]) -> io::Result<usize>;
     fn try_write(&self, bytes: &[u8]) -> io::Result<usize>;
 }
 
-/// The connections of a listener, as a stream. Dropped, it closes the listener before it returns.
+/// The accepted connections of a listener, as a stream. Dropping it closes the listener before the drop returns.
 pub(crate) struct Incoming<L: Listen> {
     accepted: mpsc::Receiver<(<L::Stream as Goodbye>::Detached, Peer)>,
     thread: Option<JoinHandle<()>>,
     stop: Option<DropGuard>,
 }
 
-/// Accepts what comes to `listener`; `speaks` where a client without a handshake understands what it is told.
+/// Accepts connections at `listener`; `speaks` is true if clients understand a message without a handshake (no TLS).
 pub(crate) fn accept_in_a_thread<L: Listen>(
     listener: L,
     limits: &ConnectionLimits,
@@ -102,7 +102,7 @@ struct Accepting {
 }
 
 impl Accepting {
-    /// Until nobody takes connections any more.
+    /// Accepts until the receiver of connections is dropped.
     async fn accept<L: Listen>(
         &mut self,
         listener: &L,
@@ -121,7 +121,7 @@ impl Accepting {
             let stream = match stream {
                 Ok(stream) => stream,
                 Err(error) => {
-                    // What has ended before it was accepted says nothing of the next one.
+                    // A connection that ended before it was accepted says nothing about the next one.
                     if !matches!(error.kind(), io::ErrorKind::ConnectionAborted | io::ErrorKind::ConnectionReset) {
                         tracing::warn!(%error, "no connection can be accepted");
                         tokio::time::sleep(AGAIN).await;
@@ -153,14 +153,14 @@ impl Accepting {
     }
 }
 
-/// Tells the other end, which is to speak HTTP/2, why its connection is closed; as much of it as is taken at once.
+/// Tells the other end, which should speak HTTP/2, why its connection is closed; as much of the message as is accepted at once.
 pub(crate) fn say_goodbye(stream: &impl Goodbye, why: &OutOfConnections) {
-    // What is closed with something unread of it is reset, and a reset may overtake what is said.
+    // Closing a socket with unread data resets the connection, and the reset may overtake the message.
     let _ = stream.try_read(&mut [0; 1_024]);
     let _ = stream.try_write(&goodbye(&why.to_string()));
 }
 
-/// What a server of HTTP/2 says first (RFC 9113, SETTINGS, empty), and last (GOAWAY, ENHANCE_YOUR_CALM) with the reason.
+/// The first frame of an HTTP/2 server (RFC 9113: an empty SETTINGS) and the last (GOAWAY with ENHANCE_YOUR_CALM and the reason).
 fn goodbye(why: &str) -> Vec<u8> {
     const SETTINGS: [u8; 9] = [0, 0, 0, 4, 0, 0, 0, 0, 0];
     const GOAWAY: u8 = 7;
@@ -189,7 +189,7 @@ impl<L: Listen> futures::Stream for Incoming<L> {
 impl<L: Listen> Drop for Incoming<L> {
     fn drop(&mut self) {
         self.stop = None;
-        // It waits for nothing but this and the next connection.
+        // The thread waits for nothing but the end of this stream and the next connection.
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }

@@ -1,19 +1,20 @@
-//! Makes the name of the server that a client at a Unix socket sends one that HTTP/2 libraries take.
+//! Replaces the server name (`:authority`) in requests over a Unix socket by one that HTTP/2 libraries accept.
 //!
-//! A client sends with each request whom it means (`:authority`, RFC 9113, section 8.3.1). At a Unix socket there is no host, and clients of
-//! gRPC's C library (Python, C++, Ruby, PHP) send the path of the socket: `%2Frun%2Fratn%2Fx.sock`. `http::uri::Authority` has no `%`, so `h2` answers
-//! such a request with RST_STREAM before any service sees it. Nobody here reads the name: its bytes are replaced before `h2` reads them.
+//! Each HTTP/2 request names the server that it is meant for (`:authority`, RFC 9113, section 8.3.1). At a Unix socket there is no host,
+//! and clients of gRPC's C library (Python, C++, Ruby, PHP) send the path of the socket: `%2Frun%2Fratn%2Fx.sock`. `http::uri::Authority`
+//! does not accept `%`, so `h2` answers such a request with RST_STREAM before any service sees it. No service here reads the name: its
+//! bytes are replaced before `h2` reads them.
 //!
 //! ```text
 //!   preface ─▶ frame header ─▶ payload: a header block (HEADERS, CONTINUATION) is walked through, others are skipped ─┐
 //!                   ▲                                                                                                 │
 //!                   └─────────────────────────────────────────────────────────────────────────────────────────────────┘
 //! ```
-//! Each byte that is replaced becomes one byte: frames keep their lengths, and both ends of the header compression (RFC 7541) keep tables
-//! of the same size. So nothing has to be decoded or kept. Names and values in Huffman code stay as they are: no client is known that sends
-//! the path of a socket in it. What is no HTTP/2 passes unchanged, for `h2` to refuse.
+//! Each replaced byte becomes one byte: frames keep their lengths, and both ends of the header compression (RFC 7541) keep tables of the
+//! same size. So no decoding and no state of the tables is needed. Huffman-coded names and values stay as they are: no known client sends
+//! the path of a socket in that form. Bytes that are not HTTP/2 pass unchanged, and `h2` refuses them.
 
-/// What a client says first.
+/// Length of the client's connection preface.
 const PREFACE_BYTES: usize = 24;
 const FRAME_HEADER_BYTES: usize = 9;
 /// Types and flags of frames (RFC 9113, section 6).
@@ -24,10 +25,10 @@ const PRIORITY: u8 = 0x20;
 const PRIORITY_BYTES: u32 = 5;
 
 const NAME: &[u8] = b":authority";
-/// Its place in the static table of the header compression (RFC 7541, appendix A).
+/// Index of `:authority` in the static table of the header compression (RFC 7541, appendix A).
 const NAME_INDEX: u32 = 1;
 
-/// How far the bytes of one connection have been looked through.
+/// The parser's position in the bytes of one connection.
 #[derive(Debug)]
 pub(super) struct Authority {
     preface_left: usize,
@@ -37,47 +38,47 @@ pub(super) struct Authority {
     block: Block,
 }
 
-/// What is left of a frame.
+/// The rest of a frame's payload.
 #[derive(Debug, Default)]
 struct Payload {
     left: u32,
     holds_headers: bool,
-    /// Its first byte says how much padding is at its end.
+    /// The first byte of the payload is the length of the padding at its end.
     says_padding: bool,
     /// Bytes before the header block.
     before: u32,
     padding: u32,
 }
 
-/// A header block, which frames may cut anywhere.
+/// A header block, which may be split across frames at any byte.
 #[derive(Debug, Default)]
 struct Block {
     at: At,
     is_authority: bool,
 }
 
-/// A place in a header block.
+/// A position in a header block.
 #[derive(Debug, Default, Clone, Copy)]
 enum At {
     /// Before a field.
     #[default]
     Field,
-    /// Within a number of several bytes, `shift` bits of which are known.
+    /// Within a number of several bytes, of which `shift` bits are known.
     Number { value: u32, shift: u32, then: Then },
     /// Before the length of a name or a value.
     Length(Part),
     /// Within a name or a value.
     Text { part: Part, left: u32, is_plain: bool, read: u32 },
-    /// It is no header block.
+    /// Not in a header block.
     Nowhere,
 }
 
-/// What a number is.
+/// The meaning of a number.
 #[derive(Debug, Clone, Copy)]
 enum Then {
-    /// A field of the table, or the table's new size: nothing follows.
+    /// The index of a whole field, or the new size of the table: nothing follows.
     Whole,
-    /// The place of a name in the table, or 0; a value follows.
+    /// The index of a name in the table, or 0; a value follows.
     NameIndex,
     /// The length of a text.
     Length { part: Part, is_plain: bool },
@@ -102,7 +103,7 @@ impl Default for Authority {
 }
 
 impl Authority {
-    /// Looks through what was read next of the connection.
+    /// Processes the next bytes that were read from the connection.
     pub(super) fn pass(&mut self, mut bytes: &mut [u8]) {
         while !bytes.is_empty() {
             let passed = self.pass_some(bytes);
@@ -110,7 +111,7 @@ impl Authority {
         }
     }
 
-    /// Looks through some of it, at least one byte; how many.
+    /// Processes at least one byte; returns how many.
     fn pass_some(&mut self, bytes: &mut [u8]) -> usize {
         if self.preface_left > 0 {
             let passed = self.preface_left.min(bytes.len());
@@ -168,7 +169,7 @@ impl Block {
         self.at = match self.at {
             At::Field => {
                 self.is_authority = false;
-                // RFC 7541, section 6: the first bits say what the field is, and the others begin a number.
+                // RFC 7541, section 6: the first bits give the kind of the field, the other bits begin a number.
                 match *byte {
                     0x80.. => self.number(*byte, 7, Then::Whole),
                     0x40..0x80 => self.number(*byte, 6, Then::NameIndex),
@@ -204,7 +205,7 @@ impl Block {
         };
     }
 
-    /// A number that begins in the last `bits` bits of a byte (RFC 7541, section 5.1).
+    /// Begins a number in the last `bits` bits of a byte (RFC 7541, section 5.1).
     fn number(&mut self, byte: u8, bits: u32, then: Then) -> At {
         let most = (1 << bits) - 1;
         let value = u32::from(byte) & most;
@@ -229,7 +230,7 @@ impl Block {
     }
 }
 
-/// Within a text, or behind it.
+/// The position within a text, or after it.
 fn text(part: Part, left: u32, is_plain: bool, read: u32) -> At {
     match (left, part) {
         (0, Part::Name) => At::Length(Part::Value),
@@ -255,7 +256,8 @@ mod tests {
         [&[u8::try_from(text.len()).unwrap()], text].concat()
     }
 
-    /// Fields before and behind one that is the authority: from the tables, with a name of its own, in Huffman code, and a size of the table.
+    /// A header block with the authority between other fields: fields from the tables, with a literal name, in Huffman code, and a table
+    /// size.
     fn block(field: &[u8], authority: &[u8]) -> Vec<u8> {
         let long = [b"%".repeat(300), vec![b'x'; 100]].concat();
         let length = [0x7f, 0x91, 0x02]; // 127 + 17 + 2 * 128
@@ -277,7 +279,7 @@ mod tests {
         b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".to_vec()
     }
 
-    /// What is made of it, however it is cut.
+    /// The bytes after processing; the result must not depend on where they are split.
     fn passed(bytes: &[u8]) -> Vec<u8> {
         let whole = |cut: usize| {
             let (mut bytes, mut authority) = (bytes.to_vec(), Authority::default());
@@ -291,7 +293,7 @@ mod tests {
         at_once
     }
 
-    /// The authority as the table has it, and with its name, each with and without a place in the table.
+    /// The authority field with an indexed and with a literal name, each added and not added to the dynamic table.
     fn fields() -> [Vec<u8>; 5] {
         let named = |first: u8| [&[first][..], &short(NAME)].concat();
         [vec![0x41], vec![0x01], vec![0x11], named(0x40), named(0x00)]

@@ -1,4 +1,4 @@
-//! The bounds of connections, and what is said of one that is beyond them.
+//! The limits of a server's connections, and the errors for connections beyond them.
 
 use super::origin::Origin;
 use std::fmt;
@@ -7,21 +7,22 @@ use std::time::Duration;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
-/// Bounds of the connections of a server.
+/// Limits of a server's connections.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ConnectionLimits {
-    /// At once, whoever has them.
+    /// Maximum number of open connections, of all callers together.
     pub connections: usize,
-    /// Accepted in a second from one user of this machine, or one host; as many as `connections` may come at once.
+    /// Maximum number of connections accepted per second from one user of this machine, or one host; the burst may be as large as
+    /// `connections`.
     pub per_s: u32,
-    /// Of one caller with calls under way.
+    /// Maximum number of connections with calls under way of one caller.
     pub of_one_caller: usize,
-    /// So many of `connections` never have calls under way of callers that are no operators. They are for operators, and for new
+    /// How many of `connections` are never in use by calls of callers that are not operators. They are reserved for operators, and for new
     /// connections.
     pub for_operators: usize,
-    /// From being accepted to the first call, the handshake of TLS included.
+    /// Maximum time from accepting a connection to its first call, including the TLS handshake.
     pub first_call: Duration,
-    /// Without a call under way.
+    /// Maximum time without a call under way.
     pub idle: Duration,
 }
 
@@ -38,37 +39,37 @@ impl Default for ConnectionLimits {
     }
 }
 
-/// Why somebody has no connection more.
+/// Why a caller gets no further connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum OutOfConnections {
-    /// All have calls under way: a new connection was closed.
+    /// All connections have calls under way: the new connection was closed.
     All,
-    /// From one user or host more connections came in a second than may: a new one was closed.
+    /// More connections per second came from one user or host than allowed: the new connection was closed.
     TooOften {
-        /// Who.
+        /// The user or host.
         origin: Origin,
         /// How many are allowed.
         per_s: u32,
     },
-    /// A caller has calls under way on as many as one may: the call was refused.
+    /// A caller has calls under way on as many connections as allowed: the call was refused.
     OfOneCaller {
-        /// Who.
+        /// The caller.
         caller: Arc<str>,
         /// How many are allowed.
         most: usize,
     },
-    /// All who are no operators have calls under way on as many as they may: the call was refused.
+    /// All callers that are not operators together have calls under way on as many connections as allowed: the call was refused.
     OfOthers {
         /// How many are allowed.
         most: usize,
     },
 }
 
-/// When a caller with too many connections may try again.
+/// Delay after which a caller with too many connections may try again.
 const RETRY_DELAY: Duration = Duration::from_secs(1);
 
 impl OutOfConnections {
-    /// In one word, for programs.
+    /// The reason code, for programs.
     pub fn reason(&self) -> &'static str {
         match self {
             OutOfConnections::All => "CONNECTIONS",
@@ -78,7 +79,7 @@ impl OutOfConnections {
         }
     }
 
-    /// What the caller is told.
+    /// The status that the caller gets.
     pub(crate) fn status(&self) -> Status {
         let mut details = ErrorDetails::with_error_info(self.reason(), "ratn", []);
         details.set_retry_info(Some(RETRY_DELAY));

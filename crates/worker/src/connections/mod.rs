@@ -1,17 +1,17 @@
-//! The connections of a server: how many there are, whose, and how long one may say nothing.
+//! The connections of a server: their number, their owners, and how long they may be idle.
 //!
 //! ```text
 //!   accepted ── first call ──▶ in use ── no call under way ──▶ idle
 //!      │ none in FIRST_CALL_DEADLINE                             │ none in IDLE_DEADLINE
 //!      └──────────────────────────▶ closed ◀─────────────────────┘
 //! ```
-//! A handshake that does not end is a connection without a call. Connections are shared out in four ways:
+//! A connection whose handshake does not end counts as one without a call. Connections are limited in four ways:
 //!
-//! - One user or host gets so many in a second (`rates`); they are accepted in a thread of their own (`accepting`), so that who connects
-//!   all the time keeps nobody waiting who is connected.
-//! - Connections with calls under way are bounded for each caller, and for all callers that are no operators together. The rest
-//!   ([`ConnectionLimits::for_operators`]) is kept for operators, and for connections that have not had a call yet.
-//! - Where there are as many connections as may be, one without a call under way is closed for a new one (`State::gives_way`).
+//! - Each user or host may open a limited number per second (`rates`). Connections are accepted in a thread of its own (`accepting`), so
+//!   that a client that connects all the time delays no client that is connected.
+//! - The number of connections with calls under way is bounded per caller, and for all callers that are not operators together. The rest
+//!   ([`ConnectionLimits::for_operators`]) is reserved for operators, and for connections without a first call.
+//! - If the maximum number is reached, a connection without a call under way is closed for a new one (`State::gives_way`).
 //! - A connection without a call is closed at its deadline.
 
 pub(crate) mod accepting;
@@ -37,9 +37,9 @@ use std::time::{Duration, Instant};
 use stream::Registered;
 use tokio_util::sync::CancellationToken;
 
-/// How often it is looked for connections whose time is over.
+/// Interval between two searches for connections whose deadline has passed.
 const SWEEP_INTERVAL: Duration = Duration::from_millis(250);
-/// Those of one server. A handle: clones share everything.
+/// The connections of one server. A handle: clones share everything.
 #[derive(Debug, Clone)]
 pub(crate) struct Connections {
     limits: ConnectionLimits,
@@ -52,7 +52,7 @@ struct State {
     open: BTreeMap<u64, Open>,
     /// Connections with calls under way, by the name of their caller.
     in_use: BTreeMap<Arc<str>, usize>,
-    /// Connections with calls under way of callers that are no operators.
+    /// Connections with calls under way of callers that are not operators.
     in_use_of_others: usize,
 }
 
@@ -64,7 +64,7 @@ struct Open {
     quiet_since: Instant,
     had_a_call: bool,
     calls: usize,
-    /// Whom it is counted for while it is in use.
+    /// The caller for whom the connection is counted while it is in use.
     caller: Option<Caller>,
 }
 
@@ -73,8 +73,8 @@ impl Connections {
         Connections { limits, state: Arc::default() }
     }
 
-    /// One more; where there are too many, one without a call under way is closed for it. What was given comes back where all have calls
-    /// under way.
+    /// Adds a connection; if there are too many, closes one without a call under way for it. If all have calls under way, the new stream is
+    /// returned as the error.
     pub(crate) fn accept<S>(&self, stream: S, peer: Peer) -> Result<Connection<S>, S> {
         let mut state = self.state();
         let there = state.open.values().filter(|open| !open.close.is_cancelled()).count();
@@ -94,12 +94,12 @@ impl Connections {
         Ok(Connection { stream, closed, registered: Registered(link), authority: None })
     }
 
-    /// Closes all that are still open.
+    /// Closes all open connections.
     pub(crate) fn close_all(&self) {
         self.state().open.values().for_each(|open| open.close.cancel());
     }
 
-    /// Closes those whose time is over, for as long as it is polled.
+    /// Closes connections whose deadline has passed, for as long as it is polled.
     pub(crate) async fn sweep(&self) -> Infallible {
         let mut interval = tokio::time::interval(SWEEP_INTERVAL);
         loop {
@@ -120,11 +120,11 @@ impl Connections {
 }
 
 impl State {
-    /// What closes the connection that gives way to a new one.
+    /// The token that closes the connection that gives way to a new one.
     ///
-    /// Operators' connections are the last to give way. As long as fewer than `share` connections have not had a call yet, an idle
-    /// connection gives way, so that who connects has time to speak; otherwise one that has not had a call. Among equals it is one
-    /// of the user or host with most of them, and of those the one that has said nothing for longest.
+    /// Operators' connections give way last. As long as fewer than `share` connections have not had a call yet, an idle connection gives
+    /// way, so that a new client has time for its first call; otherwise a connection that has not had a call. Among equals it is a
+    /// connection of the user or host with the most of them, and among those the one without a call for the longest time.
     fn gives_way(&self, share: usize) -> Option<CancellationToken> {
         let quiet = || self.open.values().filter(|open| open.calls == 0 && !open.close.is_cancelled());
         let mut of_origin = BTreeMap::<_, usize>::new();
@@ -141,7 +141,7 @@ impl State {
     }
 }
 
-/// Which connection a request came over; among its extensions.
+/// The connection that a request came over; stored in the request's extensions.
 #[derive(Debug, Clone)]
 pub(crate) struct Link {
     id: u64,
@@ -149,12 +149,12 @@ pub(crate) struct Link {
 }
 
 impl Link {
-    /// A call begins: the connection is in use until what is returned is dropped.
+    /// A call begins: the connection counts as in use until the returned value is dropped.
     pub(crate) fn begin(&self, caller: &Caller) -> Result<InUse, OutOfConnections> {
         let limits = &self.connections.limits;
         let mut state = self.connections.state();
         let State { open, in_use, in_use_of_others, .. } = &mut *state;
-        // One that is being closed: its calls end with it.
+        // The connection is being closed, and its calls end with it.
         let Some(open) = open.get_mut(&self.id) else { return Ok(InUse(self.clone())) };
         if open.calls == 0 {
             let of_others = limits.connections.saturating_sub(limits.for_operators);
@@ -175,7 +175,7 @@ impl Link {
         Ok(InUse(self.clone()))
     }
 
-    /// A call that takes no share of the connections: the connection counts as idle from now on.
+    /// Records a call that does not count as use of the connection: the idle time starts anew.
     pub(crate) fn touch(&self) {
         if let Some(open) = self.connections.state().open.get_mut(&self.id) {
             (open.quiet_since, open.had_a_call) = (Instant::now(), true);
@@ -205,7 +205,7 @@ impl Link {
     }
 }
 
-/// A call is under way on a connection.
+/// Marks a call as under way on a connection.
 #[derive(Debug)]
 pub(crate) struct InUse(Link);
 

@@ -1,14 +1,14 @@
-//! Where a connection comes from, as far as that is known before its first call.
+//! The origin of a connection, as far as it is known before the first call.
 
 use crate::gate::Identity;
 use std::fmt;
 use std::net::IpAddr;
 
-/// What is known of the other end of a connection when it is accepted.
+/// Facts about the other end of a connection when it is accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Peer {
     pub(super) origin: Origin,
-    /// Over a Unix socket the kernel says who it is; otherwise the first call does.
+    /// Over a Unix socket the kernel identifies the peer; otherwise this is known only with the first call.
     pub(super) is_operator: bool,
 }
 
@@ -17,9 +17,9 @@ pub(crate) struct Peer {
 pub enum Origin {
     /// A user of this machine.
     User(u32),
-    /// A host, by its address; of IPv6 the network, for a host has all of its addresses.
+    /// A host, by its address; for IPv6 by its /64 network, because a host may use all addresses of it.
     Host(IpAddr),
-    /// Nothing is known.
+    /// Unknown.
     Unknown,
 }
 
@@ -35,7 +35,7 @@ impl fmt::Display for Origin {
 }
 
 impl Peer {
-    /// At a Unix socket.
+    /// The peer at a Unix socket.
     pub(crate) fn of_user(identity: &Identity, is_operator: bool) -> Peer {
         let origin = match identity {
             Identity::User { uid, .. } => Origin::User(*uid),
@@ -44,7 +44,7 @@ impl Peer {
         Peer { origin, is_operator }
     }
 
-    /// At a TCP port; nothing where the connection has ended already.
+    /// The peer at a TCP port; the address is `None` if the connection has ended already.
     pub(crate) fn of_host(address: Option<IpAddr>) -> Peer {
         let origin = match address.map(|address| address.to_canonical()) {
             Some(IpAddr::V6(address)) => Origin::Host(IpAddr::V6((address.to_bits() & NETWORK_BITS).into())),

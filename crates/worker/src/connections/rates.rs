@@ -1,11 +1,11 @@
-//! How often one user or host may connect. A pure state machine: time is an argument.
+//! Rate limit of new connections per user or host. A pure state machine: time is an argument.
 
 use super::Origin;
 use crate::token_bucket::TokenBucket;
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-/// Users and hosts that are told apart; all beyond share one rate.
+/// Maximum number of origins with a rate of their own; all further ones share one rate.
 const MOST_ORIGINS: usize = 4_096;
 
 /// See the module.
@@ -22,7 +22,7 @@ impl Rates {
         Rates { per_s, at_once, of: BTreeMap::new() }
     }
 
-    /// Whether one more connection from there is accepted.
+    /// Whether one more connection from this origin is accepted.
     pub(super) fn admit(&mut self, now: Instant, origin: Origin) -> bool {
         let Rates { per_s, at_once, ref mut of } = *self;
         if of.len() >= MOST_ORIGINS && !of.contains_key(&origin) {

@@ -1,4 +1,4 @@
-//! The bytes of a connection that is counted, and closed when its time is over.
+//! The byte stream of a connection that is counted, and closed at its deadline.
 
 use super::Link;
 use super::authority::Authority;
@@ -9,7 +9,7 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio_util::sync::WaitForCancellationFutureOwned;
 use tonic::transport::server::Connected;
 
-/// A connection that ends when its time is over.
+/// A connection that ends when it is told to close.
 #[derive(Debug)]
 pub(crate) struct Connection<S> {
     pub(super) stream: S,
@@ -19,7 +19,7 @@ pub(crate) struct Connection<S> {
 }
 
 impl<S> Connection<S> {
-    /// At a Unix socket, where clients may name the server by its path.
+    /// Marks a connection at a Unix socket, where clients may send the path as the server's name.
     pub(crate) fn at_a_path(mut self) -> Connection<S> {
         self.authority = Some(Authority::default());
         self
@@ -35,7 +35,7 @@ impl Drop for Registered {
     }
 }
 
-/// What is known of a connection: what the system says, and which it is.
+/// Information about a connection: the system's, and its entry among the server's connections.
 #[derive(Debug, Clone)]
 pub(crate) struct LinkInfo<I> {
     pub(crate) info: I,

@@ -82,7 +82,7 @@ async fn callers_that_are_no_operators_leave_the_operators_share() {
     let refused = link(&open[4].0).begin(&user(2, Role::Task)).unwrap_err();
     assert!(refused.to_string().contains("all who are no operators: the quota of 4"), "{refused}");
     assert!(link(&open[4].0).begin(&user(0, Role::Operator)).is_ok());
-    // However many more connect.
+    // Even if many more connect.
     for _ in 0..50 {
         open.push(accept(&connections, host(1)).unwrap());
     }

@@ -1,51 +1,52 @@
-//! Who holds the resources of one provider, as the resource manager says. Pure: takes what a watch tells, answers for claims.
+//! The leases on one provider's resources, as reported by the resource manager. Pure: takes the updates of a watch, checks claims.
 //!
 //! ```text
 //! unheard ─ snapshot ─→ heard ─ watch breaks ─→ interrupted ─ too long ─→ unheard
 //!                         └──────── snapshot ────────┘
 //! ```
-//! While the watch is interrupted nothing is confirmed, so that nothing begins, and nothing has ended, so that what is under way goes on. Lease ids grow with the grants: an id
-//! beyond every one heard of may have been granted a moment ago, any other that holds nothing has ended or never was.
+//! While the watch is interrupted, no claim is confirmed, so that no goal begins; and no lease counts as ended, so that goals under way go
+//! on. Lease ids grow with the grants: an id beyond every known one may have been granted a moment ago; any other id that holds nothing has
+//! ended or never existed.
 
 use super::standstill::{Ending, Endings};
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_proto::types::{Resource, ResourceEvent, ResourceEventKind, ResourceUpdate};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Why nothing is confirmed before the first word of the manager.
+/// Why no claim is confirmed before the first update of the manager.
 const NEVER_HEARD: &str = "the resource manager has not been heard yet";
 
-/// Why nothing is confirmed while the watch is taken up again.
+/// Why no claim is confirmed until an interrupted watch resumes.
 const INTERRUPTED: &str = "the watch of leases was interrupted a moment ago";
 
-/// What a goal says of its lease.
+/// A goal's claim to hold a lease.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Claim<'a> {
-    /// The resource that is to perform it.
+    /// The resource that is to perform the goal.
     pub resource: &'a str,
     /// The lease.
     pub lease: LeaseId,
     /// Its fencing token.
     pub token: FencingToken,
-    /// The session that holds the lease; empty where the goal does not say it.
+    /// The session that holds the lease; empty if the goal does not name it.
     pub session: &'a str,
 }
 
-/// What the resource manager says of a claim.
+/// The result of checking a claim.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ClaimStatus {
-    /// It is so.
+    /// The claim is true.
     Confirmed,
-    /// It has not been heard of: it may have been granted a moment ago.
+    /// The lease is unknown: it may have been granted a moment ago.
     NotHeardOf {
-        /// The watch goes on, so that it will be heard of if it is true.
+        /// The watch is running, so that the grant will be reported if there was one.
         listening: bool,
     },
-    /// It is not so, and why.
+    /// The claim is false, and why.
     Refuted(String),
     /// The manager is not heard, and why: nothing is known.
     Unheard(String),
-    /// It is so, but the driver has not said yet that nothing moves of what a process before it began.
+    /// The claim is true, but the driver has not reported yet that no motion of an earlier process goes on.
     NotAtRest,
 }
 
@@ -58,20 +59,20 @@ pub struct EndedHolding {
     pub lease: LeaseId,
     /// Its fencing token: a manager that lost its state may use an id again.
     pub token: FencingToken,
-    /// Why, for people.
+    /// The reason, for people.
     pub reason: String,
 }
 
-/// Who holds what.
+/// The holders of the resources.
 #[derive(Debug)]
 pub struct Holdings {
     by_resource: BTreeMap<String, BTreeMap<LeaseId, Holder>>,
-    /// Whose end this provider is to confirm.
+    /// Ended leases for which this provider has to confirm standstill.
     endings: Endings,
-    /// The largest id heard of.
+    /// The largest lease id seen.
     youngest: LeaseId,
-    /// The session that provides the resources: what another one provides under their ids is not this provider. `None` before a manager is
-    /// followed, as in tests that tell everything themselves.
+    /// The session that provides the resources: resources that another session provides under the same ids are not this provider's. `None`
+    /// before a manager is followed, as in tests that send all updates themselves.
     owner: Option<String>,
     contact: Contact,
 }
@@ -80,7 +81,7 @@ pub struct Holdings {
 struct Holder {
     token: FencingToken,
     session: String,
-    /// Who opened that; empty where the manager does not know.
+    /// The caller who opened the session; empty if the manager does not know.
     opened_by: String,
 }
 
@@ -104,7 +105,7 @@ impl Default for Holdings {
 }
 
 impl Holdings {
-    /// What the manager says of a claim.
+    /// Checks a claim against the manager's updates.
     pub fn check(&self, claim: &Claim<'_>) -> ClaimStatus {
         if let Contact::Unheard(reason) = &self.contact {
             return ClaimStatus::Unheard(reason.clone());
@@ -120,7 +121,7 @@ impl Holdings {
                 "{lease} of {resource} is held by session `{}`, and the goal says `{session}`: acquire a lease of your own",
                 holder.session
             )),
-            // It may have ended since.
+            // The lease may have ended since.
             Some(_) if self.contact == Contact::Interrupted => ClaimStatus::Unheard(INTERRUPTED.to_owned()),
             Some(_) => ClaimStatus::Confirmed,
             None if lease > self.youngest => ClaimStatus::NotHeardOf { listening: self.contact == Contact::Heard },
@@ -128,13 +129,13 @@ impl Holdings {
         }
     }
 
-    /// Who opened the session of a lease that holds a resource; empty where nobody knows.
+    /// The caller who opened the session of a lease that holds a resource; empty if unknown.
     pub fn opened_by(&self, resource: &str, lease: LeaseId) -> &str {
         let holder = self.by_resource.get(resource).and_then(|holders| holders.get(&lease));
         holder.map_or("", |holder| &holder.opened_by)
     }
 
-    /// Why a lease that does not hold the resource is not good for it.
+    /// The reason why a lease that does not hold the resource is refused.
     pub fn not_held(&self, claim: &Claim<'_>) -> String {
         let Claim { resource, lease, token, .. } = claim;
         let holders = self.by_resource.get(*resource).into_iter().flatten();
@@ -147,12 +148,12 @@ impl Holdings {
         )
     }
 
-    /// A new watch begins, of resources that the session `owner` provides.
+    /// Begins a new watch of resources that the session `owner` provides.
     pub fn begin(&mut self, owner: &str) {
         self.owner = Some(owner.to_owned());
     }
 
-    /// The watch tells something; what has ended with it.
+    /// Applies an update of the watch; returns the holdings that ended by it.
     pub fn tell(&mut self, update: &ResourceUpdate) -> Vec<EndedHolding> {
         self.endings.tell(update, self.owner.as_deref());
         match update {
@@ -176,7 +177,7 @@ impl Holdings {
     fn happened(&mut self, event: &ResourceEvent) -> Vec<EndedHolding> {
         let or = |reason: &'static str| if event.reason.is_empty() { reason } else { event.reason.as_str() };
         if let Some((lease, _)) = event.lease {
-            // A lease of several resources is told of one by one: of the others the word is still on its way.
+            // A lease of several resources is reported one resource at a time: the reports for the others are still on their way.
             let known = if event.kind == ResourceEventKind::Leased { lease.0.saturating_sub(1) } else { lease.0 };
             self.youngest = self.youngest.max(LeaseId(known));
         }
@@ -189,31 +190,31 @@ impl Holdings {
         }
     }
 
-    /// The watch broke: what holds its resource counts as such until more is heard, and nothing is confirmed.
+    /// The watch broke: leases still count as held until the next update, and no claim is confirmed.
     pub fn interrupted(&mut self) {
         if self.contact == Contact::Heard {
             self.contact = Contact::Interrupted;
         }
     }
 
-    /// Every lease may have ended. The next snapshot says which have.
+    /// Every lease may have ended; the next snapshot shows which.
     pub fn unheard(&mut self, reason: &str) {
         self.endings.clear();
         self.contact = Contact::Unheard(reason.to_owned());
     }
 
-    /// Nothing is known any more, and what is heard next is compared with nothing.
+    /// Forgets everything: the next snapshot is not compared with earlier leases.
     pub fn lost(&mut self, reason: &str) {
         self.unheard(reason);
         self.by_resource.clear();
     }
 
-    /// Leases that have ended, and of which the manager waits for this provider to confirm standstill.
+    /// Ended leases whose standstill the manager waits for this provider to confirm.
     pub(super) fn endings(&self) -> BTreeSet<Ending> {
         self.endings.all()
     }
 
-    /// Whether the manager has been heard, and not lost since.
+    /// Whether the manager is heard, or was until the watch was interrupted.
     pub fn is_heard(&self) -> bool {
         !matches!(self.contact, Contact::Unheard(_))
     }

@@ -1,5 +1,5 @@
-//! Where the resource manager is, for a provider that somebody else starts: an endpoint, or the file that holds it. A manager that is
-//! started again may serve at another endpoint; the file then says so.
+//! The location of the resource manager, for a provider that another process starts: an endpoint, or a file that contains it. A manager
+//! that restarts may serve at another endpoint; the file then contains the new one.
 
 use crate::endpoint::{Endpoint, EndpointError};
 use crate::runtime_directory::{FindError, wait_for_file};
@@ -11,29 +11,29 @@ use std::time::Duration;
 /// The environment variable by which a process manager tells its workers where the resource manager is.
 pub const RESOURCE_MANAGER_VARIABLE: &str = "RATN_RESOURCE_MANAGER";
 
-/// What a location in a file begins with.
+/// Prefix of a location in a file.
 const FILE: &str = "file:";
-/// How long one wait for the file lasts; then that is said in the log.
+/// Maximum duration of one wait for the file; then a log line reports it.
 const FIND_DEADLINE: Duration = Duration::from_secs(10);
-/// How often the file is looked at while the manager serves.
+/// Interval between two checks of the file while the manager serves.
 const LOOK_INTERVAL: Duration = Duration::from_millis(500);
-/// The pause after a file that cannot be read.
+/// Pause after a file could not be read.
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Where the resource manager is: `http://host:port`, `unix:/path`, or `file:/run/ratn/resource-manager.endpoint`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ManagerLocation {
-    /// There, always.
+    /// A fixed endpoint.
     At(Endpoint),
-    /// Where this file says, as of now.
+    /// The endpoint in this file, read anew.
     File(PathBuf),
 }
 
 impl ManagerLocation {
-    /// What the environment says, if it says something.
+    /// The location in the environment variable, if it is set.
     ///
     /// # Errors
-    /// Where that is no location.
+    /// The text is not a location.
     pub fn from_environment() -> Result<Option<ManagerLocation>, EndpointError> {
         match std::env::var(RESOURCE_MANAGER_VARIABLE) {
             Ok(said) if !said.is_empty() => said.parse().map(Some),
@@ -41,7 +41,7 @@ impl ManagerLocation {
         }
     }
 
-    /// Where it is, as soon as that is known.
+    /// Waits until the manager's endpoint is known.
     pub(crate) async fn find(&self) -> Endpoint {
         let file = match self {
             ManagerLocation::At(endpoint) => return endpoint.clone(),
@@ -59,7 +59,7 @@ impl ManagerLocation {
         }
     }
 
-    /// Returns when the manager is somewhere else than there. A file that is gone, or holds nonsense, says nothing.
+    /// Returns when the manager has moved to another endpoint. A file that is missing or malformed is ignored.
     pub(crate) async fn moved_from(&self, endpoint: &Endpoint) {
         let ManagerLocation::File(file) = self else { return std::future::pending().await };
         loop {

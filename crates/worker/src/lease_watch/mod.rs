@@ -1,4 +1,4 @@
-//! Who holds the resources of this provider, as the resource manager says; what a goal says of its lease proves nothing.
+//! The leases on this provider's resources, as reported by the resource manager: a goal that names a lease proves nothing by that.
 //!
 //! ```text
 //!   resource manager ──watch──▶ follow (a task) ──▶ Holdings (pure) ◀── check ── ActionServer::admit
@@ -11,9 +11,9 @@
 //! manager answers again, a goal goes on only where its lease still lives.
 //!
 //! When a lease ends, the provider confirms for its own resources that nothing moves any more (`standstill.rs`). No goal begins before the
-//! driver has said that everything is at rest ([`LeaseWatch::brought_to_rest`]).
+//! driver has reported that everything is at rest ([`LeaseWatch::brought_to_rest`]).
 //!
-//! The time for which the manager is trusted is measured by [`BootClock`]: a machine that was suspended confirms nothing when it wakes up.
+//! [`BootClock`] measures for how long the manager is trusted: a machine that was suspended confirms nothing when it wakes up.
 
 mod holdings;
 mod location;
@@ -37,99 +37,101 @@ use tokio::sync::watch;
 use tokio::time::{Instant, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
-/// A lease that has not been heard of is waited for so long: its grant reaches its holder and this provider at about the same time.
+/// How long an unknown lease is waited for: its grant reaches its holder and this provider at about the same time.
 pub const GRANT_WAIT: Duration = Duration::from_secs(1);
 
-/// The pause before the manager is asked again.
+/// Pause before the manager is asked again.
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
-/// A manager to which this provider has no session is asked something so often within the time that it is trusted without an answer.
+/// Without a session of its own, a provider asks the manager this many times within the time for which the manager is trusted without an
+/// answer.
 const QUESTIONS_PER_PATIENCE: u32 = 4;
-/// A goal is suspended for so many times the patience at the most: longer than a client believes that its session may live
-/// ([`Session::gone`]), so that its own end comes first.
+/// Maximum time for which a goal is suspended, as a multiple of the patience. It is longer than a client believes that its session may live
+/// ([`Session::gone`]), so that the client ends the goal first.
 const SUSPENDED_FOR: u32 = GIVEN_UP_AFTER + 1;
-/// Why nothing is confirmed when the manager is not trusted any more, and that has not been told yet.
+/// Why no claim is confirmed when the manager is not trusted any more, before that has been reported.
 const TOO_OLD: &str = "the last word of the resource manager is too old";
-/// How often it is said that there is no watch.
+/// Interval of the log line that there is no watch.
 const WARN_INTERVAL: Duration = Duration::from_secs(10);
 
-/// Hears what ends.
+/// A listener to the end of leases.
 pub(crate) trait LeaseListener: Send + Sync {
-    /// A lease does not hold a resource any more.
+    /// A lease no longer holds a resource.
     fn lease_ended(&self, ended: &EndedHolding);
 
-    /// Every lease may have ended, and it may be heard again which have not.
+    /// Every lease may have ended. The manager may be heard again, and then tells which have not.
     fn leases_unheard(&self, reason: &str);
 
-    /// The manager has told which leases live.
+    /// The manager has reported which leases are live.
     fn leases_heard(&self);
 
-    /// Every lease may have ended, and that is not waited for any more.
+    /// Every lease may have ended, and the manager is given up.
     fn leases_lost(&self, reason: &str);
 
-    /// The goals of a resource that run, those of one lease (id and token) where it is named: each fires when its action has returned.
+    /// The running goals of a resource; if a lease (id and token) is given, only that lease's. Each token fires when the goal's action has
+    /// returned.
     fn under_way(&self, resource: &str, lease: Option<(LeaseId, FencingToken)>) -> Vec<CancellationToken>;
 }
 
-/// The leases of a provider's resources, as far as the resource manager has told of them. A handle: clones share everything.
+/// The leases of a provider's resources, as far as the resource manager has reported them. A handle: clones share everything.
 #[derive(Clone)]
 pub struct LeaseWatch {
     shared: Arc<Shared>,
 }
 
 struct Shared {
-    /// Their ids.
+    /// The resources' ids.
     resources: Vec<String>,
     holdings: Mutex<Holdings>,
-    /// Grows with everything heard.
+    /// Incremented by every update.
     heard: watch::Sender<u64>,
     listeners: Mutex<Vec<Weak<dyn LeaseListener>>>,
-    /// The driver has said that nothing moves of what was begun before this process.
+    /// The driver has reported that no motion of an earlier process goes on.
     is_brought_to_rest: watch::Sender<bool>,
-    /// Nothing begins before that: the provider offers these resources itself.
+    /// No goal begins before that report: the provider offers these resources itself.
     begins_at_rest: AtomicBool,
     trust: Mutex<Trust>,
     clock: BootClock,
 }
 
-/// How long the manager's word holds.
+/// For how long the manager's last update is trusted.
 #[derive(Debug)]
 enum Trust {
-    /// Until something else is told.
+    /// Until an update says otherwise.
     UntilTold,
-    /// As long as this session is believed in.
+    /// As long as this session is believed to live.
     Session(Belief),
-    /// For so long after the last answer.
+    /// For this duration after the last answer.
     Answers(Arc<Answered>, Duration),
 }
 
-/// Where to listen.
+/// The manager to watch.
 enum Source {
-    /// To one manager, in which a session provides the resources.
+    /// One manager, in which a session provides the resources.
     Session { client: Box<ResourceClient>, state: watch::Receiver<SessionState>, belief: Belief, id: String },
-    /// To the manager of this location, wherever it is now; this session provides the resources.
+    /// The manager at this location, wherever it is now; the session of this id provides the resources.
     Location { channels: Channels, location: ManagerLocation, provider_session: String },
 }
 
-/// What is followed now.
+/// A watch that is being followed.
 struct Following {
     stream: ResourceWatch,
     client: ResourceClient,
-    /// Of the session that was alive when it began.
+    /// Generation of the session that was alive when the watch began.
     generation: u64,
     answered: Arc<Answered>,
 }
 
-/// When the last question was asked that was answered.
+/// Time of the last question that was answered.
 #[derive(Debug)]
 struct Answered(Mutex<BootInstant>);
 
 impl LeaseWatch {
-    /// A watch of the resources of these ids. Nothing is known of them before the watch follows a manager.
+    /// A watch of the resources of these ids. No lease is known before the watch follows a manager.
     pub fn of(resources: impl IntoIterator<Item = impl Into<String>>) -> LeaseWatch {
         LeaseWatch::by(BootClock::default(), resources)
     }
 
-    /// As [`LeaseWatch::of`], measured by this clock.
+    /// As [`LeaseWatch::of`], with this clock.
     pub fn by(clock: BootClock, resources: impl IntoIterator<Item = impl Into<String>>) -> LeaseWatch {
         let shared = Shared {
             resources: resources.into_iter().map(Into::into).collect(),
@@ -149,7 +151,7 @@ impl LeaseWatch {
         &self.shared.resources
     }
 
-    /// What the resource manager has said of a claimed lease until now.
+    /// The standing of a claimed lease by what the resource manager has reported so far.
     pub fn check(&self, claim: &Claim<'_>) -> ClaimStatus {
         let standing = self.shared.holdings().check(claim);
         match standing {
@@ -159,23 +161,22 @@ impl LeaseWatch {
         }
     }
 
-    /// The caller who opened the session of a lease that holds a resource; empty where that is not known.
+    /// The caller who opened the session of a lease that holds a resource; empty if unknown.
     pub fn opened_by(&self, resource: &str, lease: LeaseId) -> String {
         self.shared.holdings().opened_by(resource, lease).to_owned()
     }
 
-    /// Whether the manager answers, or did a moment ago.
+    /// Whether the manager answers, or did until a moment ago.
     pub fn is_heard(&self) -> bool {
         self.shared.holdings().is_heard()
     }
 
-    /// Says that nothing moves any more of motions that an earlier process may have begun. A driver that was killed knows nothing of its
-    /// motions when it starts again, and its session may still live. Until this is called, no standstill is confirmed,
-    /// [`crate::provider::Provider::start_at_rest`] offers nothing, and no goal begins where [`LeaseWatch::follow_session`] is used.
-    /// [`crate::worker::Worker`] calls it by itself.
+    /// Reports that no motion of an earlier process goes on. A driver that was killed knows nothing of its motions when it starts again,
+    /// and its session may still live. Until this is called, no standstill is confirmed, [`crate::provider::Provider::start_at_rest`]
+    /// offers nothing, and no goal begins if [`LeaseWatch::follow_session`] is used. [`crate::worker::Worker`] calls it by itself.
     pub fn brought_to_rest(&self) {
         self.shared.is_brought_to_rest.send_replace(true);
-        // Goals that wait for this look again.
+        // Goals that wait for this check again.
         self.shared.heard.send_modify(|heard| *heard += 1);
     }
 
@@ -184,21 +185,22 @@ impl LeaseWatch {
         self.shared.begins_at_rest.store(true, Ordering::SeqCst);
     }
 
-    /// Returns once the driver has said [`LeaseWatch::brought_to_rest`].
+    /// Returns when the driver has called [`LeaseWatch::brought_to_rest`].
     pub(crate) async fn rested(&self) {
-        // The sender is in `self`.
+        // The sender is in `self`, so the channel is open.
         let _ = self.shared.is_brought_to_rest.subscribe().wait_for(|said| *said).await;
     }
 
-    /// Whether the driver has said [`LeaseWatch::brought_to_rest`], and no goal runs at a resource, also none that was told to stop.
+    /// Whether the driver has called [`LeaseWatch::brought_to_rest`], and no goal runs on the resource, not even one that was told to stop.
     pub fn is_at_rest(&self, resource: &str) -> bool {
         *self.shared.is_brought_to_rest.borrow()
             && self.shared.under_way(resource, None).is_none_or(|under_way| under_way.is_empty())
     }
 
-    /// Follows the manager of a session that provides the resources, for as long as the future is polled; leases are trusted as long
-    /// as the session lives, and for `patience` after the watch broke. Standstill of what a lease has left is confirmed as soon as the
-    /// actions of its goals have returned, and not before [`LeaseWatch::brought_to_rest`]; nor does any goal begin before that. Drop the future before the session is closed.
+    /// Follows the manager of a session that provides the resources, for as long as the future is polled. Leases are trusted as long as the
+    /// session lives, and for `patience` after the watch broke. The standstill of an ended lease is confirmed when the actions of its goals
+    /// have returned, and not before [`LeaseWatch::brought_to_rest`]; no goal begins before that either. Drop the future before the session
+    /// is closed.
     ///
     /// # Errors
     /// As [`Channels::get`].
@@ -223,9 +225,9 @@ impl LeaseWatch {
         })
     }
 
-    /// Follows the manager of a location, wherever it is, for as long as the future is polled; for a provider whose resources another
-    /// process offers, in the session of this id. What any other session offers under their ids is not this provider. Leases are trusted for
-    /// `patience` after the manager has answered something; it is asked four times within that.
+    /// Follows the manager at a location, for as long as the future is polled; for a provider whose resources another process offers, in
+    /// the session of this id. Resources that other sessions offer under the same ids are not this provider's. Leases are trusted for
+    /// `patience` after the manager's last answer; the manager is asked four times within that.
     pub fn follow_location(
         &self,
         channels: &Channels,
@@ -248,15 +250,15 @@ impl LeaseWatch {
         self.shared.listeners.lock().unwrap_or_else(PoisonError::into_inner).push(listener);
     }
 
-    /// Changes with everything that is heard from now on.
+    /// Notifies of every update from now on.
     pub(crate) fn heard(&self) -> watch::Receiver<u64> {
         self.shared.heard.subscribe()
     }
 
-    /// Takes an update of the manager. For tests of providers without a manager; otherwise [`LeaseWatch::follow_session`] does it.
+    /// Applies an update of the manager. For tests of providers without a manager; otherwise [`LeaseWatch::follow_session`] does it.
     pub fn tell(&self, update: &ResourceUpdate) {
         let ended = self.shared.holdings().tell(update);
-        // Whoever waits for the next lease finds the goals of the last one told to stop.
+        // A goal that waits for the next lease must find the goals of the ended lease told to stop.
         self.shared.tell(|listener| ended.iter().for_each(|ended| listener.lease_ended(ended)));
         if matches!(update, ResourceUpdate::Snapshot { .. }) {
             self.shared.tell(|listener| listener.leases_heard());
@@ -264,7 +266,7 @@ impl LeaseWatch {
         self.shared.heard.send_modify(|heard| *heard += 1);
     }
 
-    /// Every lease may have ended: goals that can be suspended are, until the manager answers; the others end.
+    /// Every lease may have ended: goals that can be suspended are suspended until the manager answers; the others end.
     pub fn unheard(&self, reason: &str) {
         self.shared.holdings().unheard(reason);
         self.shared.tell(|listener| listener.leases_unheard(reason));
@@ -281,7 +283,7 @@ impl LeaseWatch {
         loop {
             let is_lost = tokio::select! {
                 biased;
-                // Known before a connection that hangs breaks.
+                // Noticed before a hanging connection breaks.
                 () = source.is_over(following.generation) => true,
                 () = self.silence(&source, &following.client, &following.answered, patience) => true,
                 () = self.read(&mut following.stream) => false,
@@ -312,7 +314,7 @@ impl LeaseWatch {
         }
     }
 
-    /// A watch, after the manager was not heard for longer than it is trusted.
+    /// A new watch, after the manager was not heard for longer than it is trusted.
     async fn heard_again(&self, source: &Source, patience: Duration) -> Following {
         let reason = "the resource manager is not heard";
         tracing::warn!("{reason}: goals under a lease end, or are suspended, and none begins");
@@ -325,8 +327,8 @@ impl LeaseWatch {
         self.begin(source, patience).await
     }
 
-    /// Returns when the manager of a location has answered nothing for the time: one that hangs breaks no connection. That of a session
-    /// answers its pings.
+    /// Returns when the manager at a location has not answered for `patience`: a manager that hangs does not break the connection. The
+    /// manager of a session answers its pings instead.
     async fn silence(&self, source: &Source, client: &ResourceClient, answered: &Answered, patience: Duration) {
         let (Source::Location { .. }, Some(resource)) = (source, self.shared.resources.first()) else {
             return pending().await;
@@ -345,14 +347,14 @@ impl LeaseWatch {
                 () = clock.sleep_until(trusted_until) => return,
                 (asked, answer) = question => match answer {
                     Err(error) if error.is_crash() => tracing::debug!(%error, "the resource manager does not answer"),
-                    // What it says does not matter.
+                    // Any answer counts, whatever it says.
                     _ => answered.at(asked),
                 },
             }
         }
     }
 
-    /// A watch that has told which leases live.
+    /// A watch that has reported which leases are live.
     async fn begin(&self, source: &Source, patience: Duration) -> Following {
         let mut warn_at = Instant::now() + patience;
         loop {
@@ -375,7 +377,7 @@ impl LeaseWatch {
     async fn try_begin(&self, source: &Source, patience: Duration) -> Result<Following, CallError> {
         let (client, owner, generation) = match source {
             Source::Session { client, state, id, .. } => {
-                // A session that is closed tells nothing more, and this watch ends with it.
+                // A closed session reports nothing more, and this watch ends with it.
                 let mut state = state.clone();
                 let Ok(generation) = state.wait_for(|s| s.alive).await.map(|s| s.generation) else { pending().await };
                 (ResourceClient::clone(client), id.as_str(), generation)
@@ -422,7 +424,7 @@ impl Answered {
 }
 
 impl Source {
-    /// Returns when the session of then is not alive, also when that was so before.
+    /// Returns when the session of this generation is not alive, also if it was not alive before the call.
     async fn is_over(&self, generation: u64) {
         match self {
             Source::Session { state, .. } => {
@@ -445,7 +447,7 @@ impl Shared {
         self.holdings.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether what the manager has said still holds. Asked where it is used: no timer runs while the machine is suspended.
+    /// Whether the manager's last update is still trusted. Checked at each use, because no timer runs while the machine is suspended.
     fn is_trusted(&self) -> bool {
         match &*self.trust.lock().unwrap_or_else(PoisonError::into_inner) {
             Trust::UntilTold => true,
@@ -454,7 +456,7 @@ impl Shared {
         }
     }
 
-    /// Whether the driver still has to say that nothing moves of what a process before this one began.
+    /// Whether the driver still has to report that no motion of an earlier process goes on.
     fn awaits_rest(&self) -> bool {
         self.begins_at_rest.load(Ordering::SeqCst) && !*self.is_brought_to_rest.borrow()
     }
@@ -463,7 +465,7 @@ impl Shared {
         self.listeners().iter().for_each(|listener| say(&**listener));
     }
 
-    /// As [`LeaseListener::under_way`], of all listeners; `None` without any, for nobody knows then.
+    /// As [`LeaseListener::under_way`], for all listeners; `None` without any listener, because then it is unknown.
     fn under_way(&self, resource: &str, lease: Option<(LeaseId, FencingToken)>) -> Option<Vec<CancellationToken>> {
         let listeners = self.listeners();
         let under_way = listeners.iter().flat_map(|listener| listener.under_way(resource, lease));

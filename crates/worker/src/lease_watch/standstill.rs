@@ -1,14 +1,14 @@
-//! Confirming standstill: what a lease that has ended otherwise than by its holder's release had of a resource is granted anew when the
-//! resource's provider says that nothing moves any more for that lease.
+//! Confirms standstill: if a lease did not end by its holder's release, its units of a resource are granted again when the resource's
+//! provider confirms that nothing moves any more for that lease.
 //!
 //! ```text
 //!   the watch tells of units that are ending ─▶ the goals of that lease have returned ─▶ ConfirmStandstill
 //! ```
-//! Nothing is confirmed before the driver has said that it is at rest ([`LeaseWatch::brought_to_rest`]): the lease may have been that of a
-//! process before this one, whose motion nobody has stopped.
+//! Nothing is confirmed before the driver has reported that it is at rest ([`LeaseWatch::brought_to_rest`]): the lease may be one of an
+//! earlier process, whose motion nobody has stopped.
 //!
-//! This is done for resources of the provider's own session, as long as it follows the manager. A goal whose action does not return is
-//! never confirmed: the bound that the resource was offered with (`standstill_ms`) decides then.
+//! Only resources of the provider's own session are confirmed, as long as the provider follows the manager. If a goal's action does not
+//! return, its standstill is never confirmed: then the bound that the resource was offered with (`standstill_ms`) decides.
 
 use super::{LeaseWatch, RETRY_INTERVAL};
 use crate::client::{CallError, ResourceClient};
@@ -20,10 +20,10 @@ use tokio::time::{sleep, timeout};
 use tokio_util::task::AbortOnDropHandle;
 use tonic::Code;
 
-/// An answer to a confirmation is waited for this long; then the manager is asked again, over a connection made anew where the old one broke.
+/// Time limit for the answer to a confirmation; then the manager is asked again, over a new connection if the old one broke.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(1);
 
-/// What a lease that has ended has left of a resource, until its provider has confirmed standstill.
+/// The units of a resource that an ended lease still occupies until the provider has confirmed standstill.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Ending {
     pub(super) resource: String,
@@ -31,12 +31,13 @@ pub(super) struct Ending {
     pub(super) token: FencingToken,
 }
 
-/// All that a provider is to confirm, as the manager says. Pure.
+/// All endings that a provider has to confirm, as reported by the manager. Pure.
 #[derive(Debug, Default)]
 pub(super) struct Endings(BTreeSet<Ending>);
 
 impl Endings {
-    /// The watch tells something of resources, those of `owner` among them. Without an owner another process offers them, and confirms.
+    /// Applies an update; only resources of the session `owner` count. Without an owner, another process offers the resources, and
+    /// confirms.
     pub(super) fn tell(&mut self, update: &ResourceUpdate, owner: Option<&str>) {
         let of = |resource: &Resource| -> Vec<Ending> {
             let is_own = owner == Some(resource.session.as_str());
@@ -65,14 +66,14 @@ impl Endings {
 }
 
 impl LeaseWatch {
-    /// Confirms what is to be confirmed, for as long as it is polled; `client` speaks for the session that provides the resources.
+    /// Confirms the standstill of every ending, for as long as it is polled; `client` speaks for the session that provides the resources.
     pub(super) async fn confirm_standstill(self, client: ResourceClient) {
         let mut heard = self.heard();
         let mut confirming: BTreeMap<Ending, AbortOnDropHandle<()>> = BTreeMap::new();
         loop {
             heard.mark_unchanged();
             let endings = self.shared.holdings().endings();
-            // What is not ending any more needs no confirmation.
+            // An ending that is gone needs no confirmation.
             confirming.retain(|ending, _| endings.contains(ending));
             for ending in endings {
                 confirming.entry(ending).or_insert_with_key(|ending| {
@@ -91,7 +92,7 @@ impl LeaseWatch {
         if self.shared.is_brought_to_rest.subscribe().wait_for(|said| *said).await.is_err() {
             return;
         }
-        // No goal begins under it any more: the watch refutes it.
+        // No further goal begins under this lease: the watch refutes it.
         let Some(under_way) = self.shared.under_way(&resource, Some((lease, token))) else {
             return tracing::debug!(%lease, resource, "no action server has this watch: its standstill is not confirmed");
         };
@@ -112,7 +113,7 @@ impl LeaseWatch {
     }
 }
 
-/// Whether the same answer would come again.
+/// Whether a retry would get the same answer.
 fn is_final(error: &CallError) -> bool {
     use Code::{InvalidArgument, NotFound, PermissionDenied, Unimplemented};
     matches!(error.code(), Some(InvalidArgument | NotFound | PermissionDenied | Unimplemented))
@@ -177,7 +178,7 @@ mod tests {
         let mut endings = Endings::default();
         endings.tell(&snapshot(&[resource("arm", "another cell", &[7])]), Some("cell"));
         assert_eq!(left(&endings), []);
-        // A pooled worker: its process manager offers it.
+        // A pooled worker: its process manager offers the resource.
         endings.tell(&snapshot(&[resource("arm", "", &[7])]), None);
         assert_eq!(left(&endings), []);
     }

@@ -1,9 +1,8 @@
-//! The asking side: the calls of all tasks share one stream.
+//! The client side: the calls of all tasks share one stream.
 //!
-//! The stream is opened with the first call, and again with the first one after it broke; the calls that were under way then fail
-//! as calls of their own would. A call does not wait until the other side has answered the opening: many servers do that with their first
-//! message, which is the answer to a call. A call that is given up before the stream is there is not sent: whoever made it may have done something
-//! else since.
+//! The stream is opened with the first call, and again with the first call after it broke; calls under way then fail as separate calls
+//! would. A call does not wait for the other side's answer to the opening: many servers send that with their first message, which is the
+//! answer to a call. A call that is dropped before the stream is open is not sent: its caller may have done something else since.
 
 use super::Protocol;
 use crate::panic::exit_on_panic;
@@ -16,16 +15,16 @@ use tokio::sync::{mpsc, oneshot};
 use tokio_stream::Stream as Incoming;
 use tonic::{Response, Status, Streaming};
 
-/// Requests that wait for the connection; more make their callers wait.
+/// Maximum number of requests that wait for the connection; further callers wait.
 const OUTGOING: usize = 1_024;
-/// Answers before the last one that wait for a caller; one that falls further behind misses some.
+/// Maximum number of intermediate answers that wait for a caller; a caller that falls further behind misses some.
 const PROGRESS: usize = 64;
 
 /// What opens a stream: a method of a generated client.
 type Opened<P> = Result<Response<Streaming<<P as Protocol>::Response>>, Status>;
 type LastAnswer<P> = oneshot::Sender<Result<<P as Protocol>::Answer, Status>>;
 
-/// A stream that is opened when it is needed. Clones share it.
+/// A stream that is opened on demand. Clones share it.
 pub(crate) struct Multiplexer<P: Protocol> {
     stream: Arc<Mutex<Option<Stream<P>>>>,
 }
@@ -36,14 +35,14 @@ struct Stream<P: Protocol> {
     calls: Arc<Mutex<Calls<P>>>,
 }
 
-/// A request on its way.
+/// A request to be sent.
 struct Sent<P: Protocol> {
-    /// The call that it is, which goes only while somebody waits for its answer; nothing where it tells of one that was dropped.
+    /// The id of the call, which is sent only while its caller waits for the answer; `None` for the message that a call was dropped.
     call: Option<u64>,
     request: P::Request,
 }
 
-/// What is sent over a stream, in order.
+/// The requests of a stream, in order.
 pub(crate) struct Outgoing<P: Protocol> {
     requests: mpsc::Receiver<Sent<P>>,
     calls: Arc<Mutex<Calls<P>>>,
@@ -73,18 +72,18 @@ impl<P: Protocol> Incoming for Outgoing<P> {
 struct Calls<P: Protocol> {
     last_id: u64,
     waiting: BTreeMap<u64, Waiting<P>>,
-    /// Why no answer will come any more.
+    /// The reason why no answer will come any more.
     broken: Option<Status>,
 }
 
-/// Where the answers to a call go.
+/// Where the answers to a call are sent.
 struct Waiting<P: Protocol> {
     progress: Option<mpsc::Sender<P::Answer>>,
     last: LastAnswer<P>,
 }
 
 impl<P: Protocol> Multiplexer<P> {
-    /// Makes a call that has one answer; `open` is called where there is no stream.
+    /// Makes a call with one answer; `open` is called if there is no stream.
     pub(crate) async fn call<F>(&self, open: impl FnOnce(Outgoing<P>) -> F, call: P::Call) -> Result<P::Answer, Status>
     where
         F: Future<Output = Opened<P>> + Send + 'static,
@@ -92,7 +91,7 @@ impl<P: Protocol> Multiplexer<P> {
         self.open(open).call(call, None, |_| {}).await
     }
 
-    /// As [`Multiplexer::call`]; what the other side is told when the call is dropped is completed then.
+    /// As [`Multiplexer::call`]; if the call is dropped, this completes the message that tells the other side.
     pub(crate) async fn call_dropped_with<F>(
         &self,
         open: impl FnOnce(Outgoing<P>) -> F,
@@ -105,7 +104,7 @@ impl<P: Protocol> Multiplexer<P> {
         self.open(open).call(call, None, when_dropped).await
     }
 
-    /// Makes a call that may have other answers before the last one.
+    /// Makes a call that may have intermediate answers before the last one.
     pub(crate) async fn call_with_progress<F>(
         &self,
         open: impl FnOnce(Outgoing<P>) -> F,
@@ -122,7 +121,7 @@ impl<P: Protocol> Multiplexer<P> {
                 on_progress(answer);
             }
         };
-        // The other end of the progress is dropped before the last answer is handed over.
+        // The receiver of the progress is dropped before the last answer is handed over.
         let (last, ()) = tokio::join!(stream.call(call, Some(progress), |_| {}), listened);
         last
     }
@@ -164,7 +163,7 @@ impl<P: Protocol> Stream<P> {
         let told = P::when_dropped(id, &call).map(|(id, call)| (id, call, when_dropped));
         let mut under_way = UnderWay { stream: self, id, when_dropped: told };
         let traceparent = trace::current().map_or_else(String::new, |context| context.to_string());
-        // Where that fails the stream has broken, and `answered` says why.
+        // If sending fails, the stream has broken, and `answered` returns the reason.
         let _ = self.requests.send(Sent { call: Some(id), request: P::request(id, call, traceparent) }).await;
         let answer = answered.await;
         under_way.when_dropped = None;
@@ -186,7 +185,7 @@ impl<P: Protocol> Calls<P> {
         Ok(self.last_id)
     }
 
-    /// Hands an answer to its caller, unless that has dropped the call.
+    /// Hands an answer to its caller, unless the caller has dropped the call.
     fn answered(&mut self, id: u64, answer: Result<P::Answer, Status>) {
         match answer {
             Ok(answer) if !P::is_last(&answer) => {
@@ -215,7 +214,7 @@ impl<P: Protocol> Calls<P> {
 struct UnderWay<'a, P: Protocol, F: FnOnce(&mut P::Call)> {
     stream: &'a Stream<P>,
     id: u64,
-    /// What tells the other side that nobody waits for the answer any more, and what completes it.
+    /// The message that tells the other side that the call was dropped, and the function that completes it.
     when_dropped: Option<(u64, P::Call, F)>,
 }
 
@@ -232,7 +231,7 @@ impl<P: Protocol, F: FnOnce(&mut P::Call)> Drop for UnderWay<'_, P, F> {
     }
 }
 
-/// Hands out the answers until there are no more.
+/// Hands out the answers until the stream ends.
 async fn read<P: Protocol>(opened: impl Future<Output = Opened<P>>, calls: Arc<Mutex<Calls<P>>>) {
     let lock = || calls.lock().unwrap_or_else(PoisonError::into_inner);
     let broken = match opened.await {

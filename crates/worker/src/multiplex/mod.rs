@@ -1,13 +1,13 @@
-//! Many calls over one bidirectional stream, by id: each is saved the cost of an HTTP/2 stream of its own.
+//! Multiplexes many calls over one bidirectional stream, by id: no call pays for an HTTP/2 stream of its own.
 //!
 //! ```text
 //!   call ─▶ Multiplexer ─ id, call ──▶ Answers ─▶ Serve::begin
 //!    ▲                                                │
 //!    └────── by its id ◀── id, answer … last answer ◀─┘
 //! ```
-//! `client::Multiplexer` is the asking side, [`server::Answers`] the serving one. A call that is dropped tells the other side. A
-//! stream that breaks fails its calls at the client and drops them at the server. What is carried, a [`Protocol`] says; this module
-//! knows nothing of it.
+//! `client::Multiplexer` is the client side, [`server::Answers`] the server side. A dropped call is reported to the other side. A stream
+//! that breaks fails its calls at the client and drops them at the server. A [`Protocol`] defines the messages; this module knows nothing
+//! of them.
 
 pub(crate) mod client;
 pub mod server;
@@ -19,48 +19,48 @@ use tonic::{Code, Status};
 
 /// The messages of one streaming method.
 pub trait Protocol: 'static {
-    /// A call with its id, as it is sent.
+    /// A call with its id, as sent.
     type Request: Send + 'static;
-    /// An answer with the id of its call, as it is sent.
+    /// An answer with the id of its call, as sent.
     type Response: Send + 'static;
-    /// What is asked for.
+    /// A call.
     type Call: Send + 'static;
-    /// What is answered.
+    /// An answer.
     type Answer: Send + 'static;
 
-    /// A request of its parts; the last one is the W3C trace context, empty for none.
+    /// Makes a request from its parts; the last one is the W3C trace context, empty for none.
     fn request(id: u64, call: Self::Call, traceparent: String) -> Self::Request;
 
     /// The parts of a request.
     fn parts(request: Self::Request) -> (u64, Option<Self::Call>, String);
 
-    /// A response of its parts.
+    /// Makes a response from its parts.
     fn response(id: u64, answer: Result<Self::Answer, Status>) -> Self::Response;
 
     /// The parts of a response.
     fn answer(response: Self::Response) -> (u64, Result<Self::Answer, Status>);
 
-    /// The path of the method that this call is, as if it came alone.
+    /// The path of the method that this call would have as a separate call.
     fn path(call: &Self::Call) -> &'static str;
 
-    /// Whether no other answer of the same call follows.
+    /// Whether this is the last answer of its call.
     fn is_last(_: &Self::Answer) -> bool {
         true
     }
 
-    /// Whether a caller that falls behind may miss an answer before the last one.
+    /// Whether a caller that falls behind may miss this intermediate answer.
     fn may_be_missed(_: &Self::Answer) -> bool {
         true
     }
 
-    /// The call that this one ends; `id` is its own.
+    /// The id of the call that this call ends; `id` is this call's own.
     fn ends_call(id: u64, call: &Self::Call) -> Option<u64>;
 
-    /// What a client sends, under which id, when it drops this call before its last answer.
+    /// The call, with its id, that a client sends when it drops this call before the last answer.
     fn when_dropped(id: u64, call: &Self::Call) -> Option<(u64, Self::Call)>;
 }
 
-/// Conversions of the messages of a method, which are all of the same shape.
+/// Message conversions, which have the same form for all methods.
 macro_rules! messages {
     ($request:ident $call:ident, $response:ident $answer:ident) => {
         type Request = v1::$request;
@@ -92,7 +92,7 @@ macro_rules! messages {
     };
 }
 
-/// Blocks, acquires and releases of one client at the resource manager: `ResourceService.Session`.
+/// The calls of one client at the resource manager (block, acquire, release): `ResourceService.Session`.
 #[derive(Debug)]
 pub enum SessionCalls {}
 
@@ -117,7 +117,7 @@ impl Protocol for SessionCalls {
         }
     }
 
-    /// Only what waits in a queue has to be undone. A server of before looks at the request id alone, and answers.
+    /// Only a request that waits in a queue has to be undone. An older server looks only at the request id, and answers.
     fn when_dropped(id: u64, call: &session_request::Kind) -> Option<(u64, session_request::Kind)> {
         use session_request::Kind;
         let (request_id, session_id) = match call {
@@ -130,7 +130,7 @@ impl Protocol for SessionCalls {
     }
 }
 
-/// The goals of one client at a provider: `ActionService.Perform`.
+/// The goals that one client gives to a provider: `ActionService.Perform`.
 #[derive(Debug)]
 pub enum GoalCalls {}
 
@@ -158,7 +158,7 @@ impl Protocol for GoalCalls {
     }
 }
 
-/// Commits, projections and releases of one client at the world pool: `WorldPoolService.Calls`.
+/// The calls of one client at the world pool (commit, project, release): `WorldPoolService.Calls`.
 #[derive(Debug)]
 pub enum WorldCalls {}
 
@@ -178,7 +178,7 @@ impl Protocol for WorldCalls {
         None
     }
 
-    /// What was asked for is done: a commit may count already, and a projection ends with its lease.
+    /// A dropped call is performed all the same: a commit may be in effect already, and a projection ends with its lease.
     fn when_dropped(_: u64, _: &calls_request::Kind) -> Option<(u64, calls_request::Kind)> {
         None
     }

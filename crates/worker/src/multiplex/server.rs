@@ -1,9 +1,9 @@
-//! The serving side: what is polled is the stream of answers. It takes requests from the connection, keeps the calls under way and
-//! hands out their answers, all in the connection's task, so that a call costs no hop between tasks of its own.
+//! The server side: polling the stream of answers drives everything. It takes requests from the connection, keeps the calls under way and
+//! hands out their answers, all in the connection's task, so that a call needs no switch between tasks.
 //!
-//! Dropped, it drops the calls under way. A client that does not read its answers is not read from either. When the process drains,
-//! no more requests are taken; what is under way is answered, then the stream ends with [`ending`]. So it does, with that, behind a
-//! request that is too large.
+//! Dropping the stream drops the calls under way. No requests are read from a client that does not read its answers. When the process
+//! drains, no more requests are taken; calls under way are answered, then the stream ends with [`ending`]. After a request that is too
+//! large, the stream ends in the same way, with that error.
 
 use super::Protocol;
 use crate::gate::ending;
@@ -16,28 +16,28 @@ use std::task::{Context, Poll};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 use tonic::{Code, Status, Streaming};
 
-/// Requests taken in before answers get their turn.
+/// Maximum number of requests taken before answers get their turn.
 const AT_ONCE: usize = 64;
 
-/// The answers to one call; the last one ends it, as does an error.
+/// The answers to one call; the last one ends the call, as does an error.
 pub type CallAnswers<P> = BoxStream<'static, Result<<P as Protocol>::Answer, Status>>;
 
-/// What performs the calls of a stream.
+/// Performs the calls of a stream.
 pub trait Serve<P: Protocol>: Send + Unpin + 'static {
-    /// Calls under way of one stream; more are refused.
+    /// Maximum number of calls under way on one stream; further ones are refused.
     const MAX_CALLS: usize;
 
-    /// Begins a call, in this trace. `None` is a request that says nothing.
+    /// Begins a call, in this trace. `None` is an empty request.
     fn begin(&mut self, call: Option<P::Call>, context: Option<TraceContext>) -> CallAnswers<P>;
 
-    /// A call has its last answer, which is sent now.
+    /// The last answer of a call is about to be sent.
     fn answered(&mut self, _id: u64, _answer: &Result<P::Answer, Status>) {}
 
-    /// Performs a call that ends another one. `end` ends that, and says whether it was under way; its answer may not have been read
-    /// where it was not. Without an answer nothing is said.
+    /// Performs a call that ends another one. `end` ends that other call, and returns whether it was under way; if it was not, its answer
+    /// may still be unread. `None`: no answer is sent.
     fn end(&mut self, ended: u64, by: P::Call, end: impl FnOnce() -> bool) -> Option<Result<P::Answer, Status>>;
 
-    /// What is answered to a call beyond [`Serve::MAX_CALLS`].
+    /// The answer to a call beyond [`Serve::MAX_CALLS`].
     fn too_many(&self) -> Status;
 }
 
@@ -47,10 +47,10 @@ pub struct Answers<P: Protocol, S> {
     requests: Option<Streaming<P::Request>>,
     calls: SelectAll<Call<P>>,
     under_way: usize,
-    /// What ends a call early, by its id. An id of 0 is that of calls that need not be told apart.
+    /// Handles that end calls early, by id. Calls with the id 0 need not be told apart.
     by_id: BTreeMap<u64, AbortHandle>,
     draining: Option<Pin<Box<WaitForCancellationFutureOwned>>>,
-    /// With what the stream ends when everything under way is answered.
+    /// The status with which the stream ends when all calls under way are answered.
     ends_with: Option<Status>,
 }
 
@@ -76,7 +76,7 @@ impl<P: Protocol, S: Serve<P>> Answers<P, S> {
         }
     }
 
-    /// Begins what is asked for; or what is answered at once, under which id.
+    /// Begins the requested call, or returns an immediate answer with its id.
     fn take(&mut self, request: P::Request) -> Option<(u64, Result<P::Answer, Status>)> {
         let (id, call, traceparent) = P::parts(request);
         let call = match call.map(|call| (P::ends_call(id, &call), call)) {
@@ -137,14 +137,14 @@ impl<P: Protocol, S: Serve<P>> Stream for Answers<P, S> {
                         return Poll::Ready(Some(Ok(P::response(id, answer))));
                     }
                 }
-                // There are no more requests; what is under way is still answered.
+                // The client sends no more requests; calls under way are still answered.
                 Poll::Ready(None) => this.requests = None,
-                // A request is too large: none is read after it, and what is under way is still answered.
+                // A request is too large: no further one is read, and calls under way are still answered.
                 Poll::Ready(Some(Err(status))) if status.code() == Code::OutOfRange => {
                     this.requests = None;
                     this.ends_with.get_or_insert(status);
                 }
-                // Most often nobody is there to read an answer.
+                // The client is usually gone and reads no answer.
                 Poll::Ready(Some(Err(status))) => return Poll::Ready(Some(Err(status))),
                 Poll::Pending => break,
             }

@@ -1,16 +1,16 @@
-//! Until when what a provider has lost at the manager may still move for who held it there. That outlives what is desired: a resource may be
-//! withdrawn meanwhile, and wanted again.
+//! For each resource that the manager has lost: until when its former holder may still move it. These bounds are kept apart from the
+//! desired state, because a resource may be withdrawn meanwhile, and offered again.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 use tokio::time::Instant;
 
-/// By id of a resource; what has passed is forgotten.
+/// Ends of the bounds by resource id; those that have passed are removed.
 #[derive(Debug, Default)]
 pub(super) struct Bounds(BTreeMap<String, Instant>);
 
 impl Bounds {
-    /// Who held it may move it for so long from now on; nobody does where it has no bound for standstill.
+    /// The former holder may move the resource for `standstill` from now on; without a bound nothing moves.
     pub(super) fn lost(&mut self, id: &str, standstill: Option<Duration>) {
         let now = Instant::now();
         self.0.retain(|_, until| *until > now);

@@ -7,7 +7,7 @@ use ratn_proto::v1;
 use ratn_proto::v1::safety_service_client::SafetyServiceClient;
 use tonic::Status;
 
-/// Asks a driver for emergency stop and hold.
+/// A client for emergency stop and hold of one driver.
 #[derive(Debug, Clone)]
 pub struct SafetyClient {
     client: SafetyServiceClient<crate::trace::Traced>,
@@ -18,13 +18,13 @@ impl SafetyClient {
     /// The client of the driver at `endpoint`.
     ///
     /// # Errors
-    /// [`CallError::Broken`] when the endpoint makes no URI.
+    /// [`CallError::Broken`] if the endpoint makes no URI.
     pub fn new(channels: &Channels, endpoint: &Endpoint) -> Result<SafetyClient, CallError> {
         let client = SafetyServiceClient::new(channels.to_provider(endpoint)?);
         Ok(SafetyClient { client, endpoint: endpoint.clone() })
     }
 
-    /// Emergency stop. Returns the state in force, when the driver has confirmed that nothing moves.
+    /// Emergency stop. Returns the state in force after the driver has confirmed that nothing moves.
     ///
     /// # Errors
     /// [`CallError`]: the robot may still move.

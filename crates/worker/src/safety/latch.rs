@@ -1,21 +1,21 @@
-//! An emergency stop on the disk: a file that is there while the stop is in force, with its reason.
+//! An emergency stop on disk: a file with the stop's reason, which exists while the stop is in force.
 //!
-//! Both the file and its folder are synced, so that a stop that was confirmed is still in force after a power loss. It belongs into
-//! a state directory: a runtime directory is empty after a reboot.
+//! Both the file and its folder are synced, so that a confirmed stop is still in force after a power loss. Put the file into a state
+//! directory: a runtime directory is empty after a reboot.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// The file. Clones are of the same one.
+/// The file. Clones refer to the same file.
 #[derive(Debug, Clone)]
 pub(super) struct Latch {
     file: Arc<Path>,
 }
 
 impl Latch {
-    /// In this file; its folder is made if it is not there.
+    /// A latch in this file; its folder is made if it does not exist.
     pub(super) fn at(file: PathBuf) -> io::Result<Latch> {
         let latch = Latch { file: file.into() };
         let folder = latch.folder();
@@ -28,7 +28,7 @@ impl Latch {
         Ok(latch)
     }
 
-    /// The reason of the stop that is in force, if one is.
+    /// The reason of the stop in force, if any.
     pub(super) fn read(&self) -> io::Result<Option<String>> {
         match fs::read(&self.file) {
             Ok(reason) => Ok(Some(String::from_utf8_lossy(&reason).into_owned())),
@@ -37,13 +37,13 @@ impl Latch {
         }
     }
 
-    /// Returns when the stop is on the disk.
+    /// Returns when the stop is on disk.
     pub(super) async fn set(&self, reason: &str) -> Result<(), String> {
         let (latch, reason) = (self.clone(), reason.to_owned());
         self.on_disk("written", move || latch.write(&reason)).await
     }
 
-    /// Returns when the stop is gone from the disk.
+    /// Returns when the stop has been removed from the disk.
     pub(super) async fn clear(&self) -> Result<(), String> {
         let latch = self.clone();
         self.on_disk("removed", move || latch.remove()).await

@@ -6,11 +6,11 @@
 //! ```
 //! A [`Safety`] is the state of one driver. A stop and a hold are in force at once. They are confirmed to the caller when the driver's
 //! [`Brakes`] have carried them out. (The pure `machine` decides all of that; this module performs its commands.) An
-//! [`crate::action::ActionServer`] with a `Safety` ends every goal `stopped` while a stop is in force; an action pauses itself with
+//! [`crate::action::ActionServer`] with a `Safety` ends every goal with `stopped` while a stop is in force; an action pauses itself with
 //! [`crate::action::GoalContext::while_held`]. A stop that is kept in a file outlasts the process and a reboot.
 //!
-//! It does not stop motors by itself. The emergency stop of a real robot is a circuit; this is how its software learns of one, and asks for
-//! one.
+//! It does not stop motors by itself. The emergency stop of a real robot is an electric circuit; this module lets the robot's software
+//! report such a stop, and request one.
 
 mod client;
 mod latch;
@@ -33,10 +33,10 @@ use tokio::sync::{oneshot, watch};
 use tokio::task::AbortHandle;
 use tokio::time::Instant;
 
-/// A part of the process, for its log.
+/// The name of this part of the process in the log.
 const PART: &str = "emergency stop and hold";
 
-/// What is in force at a driver.
+/// The state in force at a driver.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum SafetyState {
@@ -45,34 +45,35 @@ pub enum SafetyState {
     Ready,
     /// Goals pause.
     Held {
-        /// Who wants it, and why.
+        /// The reason, with the person or program that asked.
         reason: String,
     },
-    /// Goals end `stopped`.
+    /// Goals end with `stopped`.
     Stopped {
-        /// Who wants it, and why.
+        /// The reason, with the person or program that asked.
         reason: String,
     },
 }
 
-/// Carries a state out: pauses motors, ends motions, lets them go on.
+/// Carries a safety state out: pauses motors, ends motions, lets them go on.
 #[tonic::async_trait]
 pub trait Brakes: Send + Sync + 'static {
     /// Carries `state` out and returns when that is done: for `Held` and `Stopped`, when nothing moves.
     ///
-    /// It may be called for a state that is carried out already, and is called again for one that it did not confirm, whether or not the
-    /// caller who asked still waits. A stop or a hold does not wait for an earlier call: the earlier future is dropped at the point where it
-    /// waits, and the two may overlap until it gets there. What the newer call did is then done once more.
+    /// It may be called for a state that is carried out already. It is called again for a state that it did not confirm, whether or not the
+    /// caller still waits. A stop or a hold does not wait for an earlier call: the earlier future is dropped at its next await point, and
+    /// the two may overlap until then. The newer call is repeated after that.
     ///
-    /// Work that goes on after the future was dropped (`spawn_blocking`, a thread, another process) is unknown to who calls: it could release what a newer
-    /// call has stopped. Where there is such work, a newer call must not confirm before that is over, and do its own once more then.
+    /// Work that goes on after the future was dropped (`spawn_blocking`, a thread, another process) is unknown to the caller: it could
+    /// release what a newer call has stopped. If there is such work, a newer call must not confirm before that work is over, and must then
+    /// repeat its own.
     ///
     /// # Errors
     /// Why the state is not carried out, or may not be.
     async fn apply(&self, state: &SafetyState) -> Result<(), String>;
 }
 
-/// Brakes for a driver whose actions look at the state themselves.
+/// For a driver whose actions check the state themselves.
 #[derive(Debug, Clone, Copy, Default)]
 struct NoBrakes;
 
@@ -87,7 +88,7 @@ impl Brakes for NoBrakes {
 #[derive(Clone)]
 pub struct Safety {
     shared: Arc<Shared>,
-    /// False where its actions look at the state themselves: then nobody knows when nothing moves.
+    /// False if the actions check the state themselves: then it is unknown when nothing moves.
     has_brakes: bool,
 }
 
@@ -95,11 +96,11 @@ struct Shared {
     state: watch::Sender<SafetyState>,
     brakes: Arc<dyn Brakes>,
     latch: Option<Latch>,
-    /// Never held across an `await`.
+    /// Never locked across an `await`.
     control: Mutex<Control>,
 }
 
-/// The machine, with what its names stand for.
+/// The machine, and the callers and applications that its ids refer to.
 struct Control {
     machine: Machine,
     last_call: u64,
@@ -107,7 +108,7 @@ struct Control {
     applications: BTreeMap<Application, AbortHandle>,
 }
 
-/// A call that waits for its answer; dropped, it does not wait any more.
+/// A call that waits for its answer; dropping it ends the wait.
 struct WaitingCall<'a> {
     shared: &'a Arc<Shared>,
     call: Call,
@@ -116,25 +117,25 @@ struct WaitingCall<'a> {
 /// Why a state was not carried out.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SafetyError {
-    /// An emergency stop is in force, so nothing may go on.
+    /// An emergency stop is in force, so motion may not go on.
     #[error("an emergency stop is in force ({reason}): clear it first, `ratn stop --clear`")]
     Stopped {
         /// Its reason.
         reason: String,
     },
-    /// The brakes, or the disk, have not yet confirmed the stop or the hold that is in force; nothing is released before.
+    /// The brakes, or the disk, have not yet confirmed the stop or hold that is in force; it cannot be released before.
     #[error(
         "{}, and not confirmed yet: it stays in force; ask for it again until it is confirmed, then end it",
         in_force(state)
     )]
     NotConfirmed {
-        /// What is in force.
+        /// The state in force.
         state: SafetyState,
     },
     /// The brakes did not confirm.
     #[error("not confirmed, go and look: {0}")]
     Brakes(String),
-    /// The stop cannot be written to the disk, or removed from it: after a restart, the driver may have forgotten it, or find an old one.
+    /// The stop cannot be written to the disk, or removed from it: after a restart the driver may not know of it, or may find an old one.
     #[error("the stop is in force, but not as it is on the disk, which a restart goes by: {0}")]
     Latch(String),
 }
@@ -152,8 +153,8 @@ impl Safety {
         Safety::of(brakes, None, Machine::new(false))
     }
 
-    /// As [`Safety::new`], with stops kept in `file`. A stop that the file holds already is in force from the beginning. Put the file into a
-    /// state directory: a runtime directory may be empty after a reboot.
+    /// As [`Safety::new`], with stops kept in `file`. If the file already contains a stop, that stop is in force from the beginning. Put
+    /// the file into a state directory: a runtime directory may be empty after a reboot.
     ///
     /// # Errors
     /// The file exists and cannot be read, its folder cannot be made, or the brakes do not confirm.
@@ -181,14 +182,14 @@ impl Safety {
         self.shared.state.subscribe()
     }
 
-    /// What is in force.
+    /// The state in force.
     pub fn state(&self) -> SafetyState {
         self.shared.state.borrow().clone()
     }
 
-    /// Emergency stop, from any state and whatever the brakes are doing. It is in force at once. Returns when nothing moves and the stop is on
-    /// the disk (where stops are kept). The state is `Stopped` also where that is not confirmed, or where the future is dropped. A second
-    /// call does again what was not confirmed.
+    /// Emergency stop, from any state and whatever the brakes are doing. It is in force at once. Returns when nothing moves and the stop is
+    /// on disk (if stops are kept). The state is `Stopped` even if that is not confirmed, or if the future is dropped. A second call
+    /// repeats what was not confirmed.
     ///
     /// # Errors
     /// [`SafetyError::Brakes`], and [`SafetyError::Latch`].
@@ -200,18 +201,18 @@ impl Safety {
     /// Ends an emergency stop. Goals that were stopped do not go on.
     ///
     /// # Errors
-    /// [`SafetyError::Brakes`], and [`SafetyError::Latch`] where the file that keeps the stop cannot be removed: it stays in force then.
-    /// [`SafetyError::NotConfirmed`] while the brakes have not answered to the stop, and [`SafetyError::Stopped`] where another one is
-    /// asked for before the brakes have let go.
+    /// [`SafetyError::Brakes`], and [`SafetyError::Latch`] if the file with the stop cannot be removed: then the stop stays in force.
+    /// [`SafetyError::NotConfirmed`] while the brakes have not answered to the stop, and [`SafetyError::Stopped`] if another stop is
+    /// requested before the brakes are released.
     pub async fn clear(&self) -> Result<SafetyState, SafetyError> {
         self.ask(Question::Clear).await
     }
 
-    /// Pauses goals that run, and goals that are given, until [`Safety::go_on`]. It is in force at once. Returns when nothing moves. A second
-    /// call asks the brakes again, unless they have confirmed. During an emergency stop the stop remains.
+    /// Pauses running and new goals until [`Safety::go_on`]. It is in force at once. Returns when nothing moves. A second call asks the
+    /// brakes again, unless they have confirmed. During an emergency stop the stop remains.
     ///
     /// # Errors
-    /// [`SafetyError::Brakes`]; while a stop is in force as [`Safety::stop`].
+    /// [`SafetyError::Brakes`]; while a stop is in force, as [`Safety::stop`].
     pub async fn hold(&self, reason: &str) -> Result<SafetyState, SafetyError> {
         tracing::info!(reason, "hold");
         self.ask(Question::Hold { reason: reason.to_owned() }).await
@@ -221,13 +222,13 @@ impl Safety {
     ///
     /// # Errors
     /// [`SafetyError::Stopped`] while a stop is in force, [`SafetyError::NotConfirmed`] while the brakes have not answered to the hold, or
-    /// where another one is asked for before they have let go; else [`SafetyError::Brakes`].
+    /// if another hold is requested before they are released; else [`SafetyError::Brakes`].
     pub async fn go_on(&self) -> Result<SafetyState, SafetyError> {
         self.ask(Question::GoOn).await
     }
 
-    /// Has the brakes end motions that an earlier process may have begun; then the state in force is carried out again. False where there are
-    /// no brakes.
+    /// Makes the brakes end motions that an earlier process may have begun; then the state in force is carried out again. False if there
+    /// are no brakes.
     ///
     /// # Errors
     /// [`SafetyError::Brakes`].
@@ -235,19 +236,19 @@ impl Safety {
         self.ask(Question::Rest).await.map(|_| self.has_brakes)
     }
 
-    /// Resolves when a stop is in force: its reason.
+    /// Resolves when a stop is in force, with its reason.
     pub(crate) async fn stopped(&self) -> String {
         let mut state = self.watch();
         let stopped =
             state.wait_for(|state| matches!(state, SafetyState::Stopped { .. })).await.map(|state| state.clone());
         match stopped {
             Ok(SafetyState::Stopped { reason }) => reason,
-            // The sender is in `self`.
+            // The sender is in `self`, so the channel is open.
             _ => std::future::pending().await,
         }
     }
 
-    /// For [`crate::server::Services::with`].
+    /// The gRPC service, for [`crate::server::Services::with`].
     pub fn into_service(self) -> SafetyServiceServer<Safety> {
         SafetyServiceServer::new(self)
     }
@@ -263,7 +264,7 @@ impl Safety {
             call
         };
         let _waiting = WaitingCall { shared: &self.shared, call };
-        // Every call that is waited for is answered.
+        // The machine answers every call whose caller waits.
         answered.await.unwrap_or_else(|_| Err(SafetyError::Brakes("nobody answers for the brakes".to_owned())))
     }
 }
@@ -300,14 +301,14 @@ impl Shared {
             Command::RemoveLatch => self.keep(|latch| async move { Event::Unlatched(latch.clear().await) }),
             Command::Answer { call, answer } => {
                 if let Some(caller) = control.callers.remove(&call) {
-                    // It may be gone.
+                    // The caller may be gone.
                     let _ = caller.send(answer);
                 }
             }
         }
     }
 
-    /// In a task of its own: the brakes are not released halfway because a caller is gone.
+    /// Applies the brakes in a task of its own: a release must not be cut short because its caller is gone.
     fn apply(self: Arc<Self>, application: Application, state: SafetyState) -> AbortHandle {
         let brakes = self.brakes.clone();
         let applying = tokio::spawn(async move { brakes.apply(&state).await });
@@ -325,12 +326,12 @@ impl Shared {
         abort
     }
 
-    /// Changes what is on the disk, also in a task of its own.
+    /// Changes the file, also in a task of its own.
     fn keep<F>(self: &Arc<Self>, work: impl FnOnce(Latch) -> F)
     where
         F: Future<Output = Event> + Send + 'static,
     {
-        // The machine asks for this only where a stop is kept.
+        // The machine commands this only if stops are kept.
         let Some(latch) = self.latch.clone() else { return };
         let (shared, work) = (self.clone(), work(latch));
         let kept = async move {
@@ -352,7 +353,7 @@ impl Drop for WaitingCall<'_> {
     }
 }
 
-/// In words.
+/// The state in words.
 fn in_force(state: &SafetyState) -> String {
     match state {
         SafetyState::Ready => "ready".to_owned(),
@@ -386,7 +387,7 @@ mod tests {
         let safety = Safety::default();
         assert_eq!(safety.hold("a look").await, Ok(SafetyState::Held { reason: "a look".into() }));
         assert_eq!(safety.stop("a hand").await, Ok(SafetyState::Stopped { reason: "a hand".into() }));
-        // Neither a second stop, a hold nor going on changes it.
+        // A second stop, a hold or going on does not change it.
         assert_eq!(safety.stop("another").await, Ok(SafetyState::Stopped { reason: "a hand".into() }));
         assert_eq!(safety.hold("a look").await, Ok(SafetyState::Stopped { reason: "a hand".into() }));
         assert_eq!(safety.go_on().await, Err(SafetyError::Stopped { reason: "a hand".into() }));
@@ -420,7 +421,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let file = place.path().join("cell").join("stopped");
         let safety = Safety::kept_in(file.clone(), NoBrakes).await.unwrap();
-        // A folder in the way of the file.
+        // A folder with the name of the file to be written.
         std::fs::create_dir(file.with_extension("new")).unwrap();
         let refused = safety.stop("a hand").await.unwrap_err();
         assert!(matches!(&refused, SafetyError::Latch(_)) && refused.to_string().contains("stopped"), "{refused}");
@@ -444,7 +445,7 @@ mod tests {
         assert!(Safety::kept_in(file, NoBrakes).await.is_err(), "nobody moves before it is known");
     }
 
-    /// Hangs when it is to hold, and confirms everything else.
+    /// Brakes that hang on a hold, and confirm everything else.
     struct HangsInHold;
 
     #[tonic::async_trait]
@@ -463,7 +464,7 @@ mod tests {
         let mut start = Box::pin(safety.bring_to_rest());
         assert!(futures::poll!(&mut start).is_pending());
         assert_eq!(safety.stop("a hand").await, Ok(SafetyState::Stopped { reason: "a hand".into() }));
-        // Nothing moves, which the start waited for.
+        // Nothing moves: that is what the start waited for.
         assert_eq!(start.await, Ok(true));
         assert_eq!(safety.clear().await, Ok(SafetyState::Ready));
     }

@@ -1,4 +1,4 @@
-//! gRPC in front of a [`Safety`].
+//! The gRPC adapter of [`Safety`].
 
 use super::{Safety, SafetyError, SafetyState};
 use crate::access::Caller;
@@ -60,7 +60,7 @@ impl From<SafetyError> for Status {
     }
 }
 
-/// What came of a change, once it is written down.
+/// Writes the result of a change to the audit log, and returns it.
 fn audited(pending: Pending, changed: Result<SafetyState, SafetyError>) -> Result<v1::SafetyState, Status> {
     let changed = changed.map_err(Status::from);
     pending.ended(&changed);

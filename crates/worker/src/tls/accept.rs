@@ -1,4 +1,4 @@
-//! A server's side of handshakes, in front of the HTTP/2 of tonic, which has one config from its start to its end.
+//! The server's side of TLS handshakes. It stands in front of tonic's HTTP/2, because tonic keeps one TLS config from start to end.
 
 use super::LiveServerTls;
 use futures::future;
@@ -9,8 +9,8 @@ use tokio_rustls::TlsAcceptor;
 use tokio_rustls::server::TlsStream;
 use tokio_util::task::AbortOnDropHandle;
 
-/// Connections whose handshake succeeded within `patience`. Handshakes go on side by side, and there are as many as there may be
-/// connections: whoever limits those ([`crate::connections`]) ends the handshake of one that has to give way.
+/// Connections whose handshake succeeded within `patience`. Handshakes run concurrently, as many as there may be connections:
+/// [`crate::connections`] limits those, and ends the handshake of a connection that has to give way.
 pub(crate) fn handshakes<S>(
     accepted: impl futures::Stream<Item = io::Result<S>>,
     tls: LiveServerTls,

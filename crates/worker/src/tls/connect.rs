@@ -1,4 +1,4 @@
-//! A client's side of handshakes: each connection is made with what the client trusts and shows at that time.
+//! The client's side of TLS handshakes: each connection uses the trusted authorities and the certificate of that time.
 
 use super::{ALPN_H2, CA_VARIABLE, ClientTls};
 use crate::endpoint::over_tcp;
@@ -14,7 +14,7 @@ use tokio_rustls::client::TlsStream;
 use tokio_rustls::rustls::pki_types::ServerName;
 use tonic::codegen::{Service, StdError, http::Uri};
 
-/// Connects over TCP, then with TLS to the host of its certificate.
+/// Connects over TCP, then with TLS; the server's certificate must be for the host.
 #[derive(Debug, Clone)]
 pub(crate) struct Connector {
     tcp: HttpConnector,
@@ -23,7 +23,7 @@ pub(crate) struct Connector {
 }
 
 impl Connector {
-    /// To `host`, as it is in the server's certificate, with what `tls` trusts and shows.
+    /// A connector to `host`, as named in the server's certificate, with the settings of `tls`.
     pub(crate) fn to(host: &str, tls: &ClientTls) -> Connector {
         Connector { tcp: over_tcp(), host: host.to_owned(), tls: tls.clone() }
     }

@@ -1,6 +1,6 @@
-//! TLS of both sides: a server's own certificate and the authorities whose clients it lets in; what a client trusts and shows.
+//! TLS of both sides: a server's certificate and the authorities of its clients; the authorities that a client trusts, and its certificate.
 //!
-//! A client is given its [`ClientTls`] when it is made ([`crate::client::Channels::new`]): two clients of one process may trust different
+//! A client gets its [`ClientTls`] when it is made ([`crate::client::Channels::new`]): two clients of one process may trust different
 //! authorities. A program reads its own once, at its start, from the environment ([`ClientTls::from_environment`]: `RATN_TLS_CA`,
 //! `RATN_TLS_CERT`, `RATN_TLS_KEY`, which the workers of a process manager inherit). All files are PEM.
 //!
@@ -9,7 +9,7 @@
 //!     ▲        └────▶ ClientTls ──────▶ every connection that is made      (connect)
 //!     └── read_again: both, or neither
 //! ```
-//! A connection has what was there when it was made, until it ends.
+//! A connection keeps the settings with which it was made until it ends.
 
 pub(crate) mod accept;
 pub(crate) mod connect;
@@ -28,44 +28,44 @@ use tokio_rustls::rustls::{ClientConfig, RootCertStore, ServerConfig};
 /// The protocol that both sides agree upon in their handshake: HTTP/2.
 const ALPN_H2: &[u8] = b"h2";
 
-/// The environment variable with the file of the authorities that a client trusts.
+/// The environment variable with the file of the certificate authorities that a client trusts.
 pub const CA_VARIABLE: &str = "RATN_TLS_CA";
 /// The environment variable with the file of a client's certificate.
 pub const CERT_VARIABLE: &str = "RATN_TLS_CERT";
-/// The environment variable with the file of its private key.
+/// The environment variable with the file of the client's private key.
 pub const KEY_VARIABLE: &str = "RATN_TLS_KEY";
 
-/// Files of a server.
+/// TLS files of a server.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ServerTls {
-    /// Its certificate, with those between it and the authority.
+    /// Its certificate, followed by the intermediate certificates up to the authority.
     pub cert: PathBuf,
     /// Its private key.
     pub key: PathBuf,
-    /// The authorities of clients: only who shows a certificate of theirs gets in.
+    /// The authorities of clients: only clients with a certificate that one of them signed are admitted.
     pub client_ca: PathBuf,
 }
 
-/// Files of a server and what was in them when they were last read. A handle: clones share everything.
+/// TLS files of a server, and their content when they were last read. A handle: clones share everything.
 #[derive(Clone)]
 pub struct LiveServerTls {
     files: ServerTls,
     config: Arc<RwLock<Option<Arc<ServerConfig>>>>,
 }
 
-/// What a client trusts and shows. A handle: clones share everything, so that files which are read again count for every connection that any
-/// of them makes afterwards.
+/// The authorities that a client trusts and the certificate that it presents. A handle: clones share everything, so that files which are
+/// read again apply to every connection that any of them makes afterwards.
 #[derive(Clone)]
 pub struct ClientTls {
-    /// `None` where no server is trusted.
+    /// `None` if no server is trusted.
     live: Option<Arc<LiveClientTls>>,
 }
 
-/// Files of a client and what was in them when they were last read.
+/// TLS files of a client, and their content when they were last read.
 struct LiveClientTls {
     authorities: PathBuf,
-    /// A certificate and its key.
+    /// The files of its certificate and key.
     shown: Option<(PathBuf, PathBuf)>,
     config: RwLock<Arc<ClientConfig>>,
 }
@@ -74,31 +74,31 @@ struct LiveClientTls {
 #[derive(Debug, thiserror::Error)]
 #[error("cannot read the TLS file {} ({what})", file.display())]
 pub struct TlsError {
-    /// Which.
+    /// The file.
     pub file: PathBuf,
-    /// What it is for.
+    /// The purpose of the file.
     pub what: &'static str,
-    /// Why.
+    /// The cause.
     #[source]
     pub source: io::Error,
 }
 
 impl LiveServerTls {
-    /// Of these files, which are not read yet.
+    /// For these files, which are not read yet.
     pub fn new(files: ServerTls) -> LiveServerTls {
         LiveServerTls { files, config: Arc::default() }
     }
 
-    /// Reads the files: every handshake from now on is with what is in them.
+    /// Reads the files: every handshake from now on uses their content.
     ///
     /// # Errors
-    /// [`TlsError`] of the first that cannot be read or holds nothing usable; then what was there before stays.
+    /// [`TlsError`] of the first file that cannot be read or holds nothing usable; then the previous content stays in use.
     pub fn load(&self) -> Result<(), TlsError> {
         self.replace(self.files.config()?);
         Ok(())
     }
 
-    /// What was read last; none before.
+    /// The content read last; `None` before the first [`LiveServerTls::load`].
     fn current(&self) -> Option<Arc<ServerConfig>> {
         self.config.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
@@ -141,33 +141,33 @@ impl ClientTls {
         ClientTls { live: None }
     }
 
-    /// Reads the files: the authorities, and the certificate and the key that are shown, if any.
+    /// Reads the files: the authorities, and the client's certificate and key, if any.
     ///
     /// # Errors
-    /// [`TlsError`] of the first that cannot be read or holds nothing usable.
+    /// [`TlsError`] of the first file that cannot be read or holds nothing usable.
     pub fn read(authorities: &Path, shown: Option<(&Path, &Path)>) -> Result<ClientTls, TlsError> {
         let shown = shown.map(|(cert, key)| (cert.to_owned(), key.to_owned()));
         let config = RwLock::new(Arc::new(client_config(authorities, shown.as_ref())?));
         Ok(ClientTls { live: Some(Arc::new(LiveClientTls { authorities: authorities.to_owned(), shown, config })) })
     }
 
-    /// Reads the files that the environment names ([`CA_VARIABLE`], [`CERT_VARIABLE`] and [`KEY_VARIABLE`]); [`ClientTls::none`] where it names
-    /// no authorities.
+    /// Reads the files that the environment names ([`CA_VARIABLE`], [`CERT_VARIABLE`] and [`KEY_VARIABLE`]); [`ClientTls::none`] if it
+    /// names no authorities.
     ///
     /// # Errors
-    /// [`TlsError`] of a file that it names and that cannot be read.
+    /// [`TlsError`] if a file that the environment names cannot be read.
     pub fn from_environment() -> Result<ClientTls, TlsError> {
         let Some(authorities) = variable(CA_VARIABLE) else { return Ok(ClientTls::none()) };
         let shown = variable(CERT_VARIABLE).zip(variable(KEY_VARIABLE));
         ClientTls::read(&authorities, shown.as_ref().map(|(cert, key)| (cert.as_path(), key.as_path())))
     }
 
-    /// Whether it trusts no server ([`ClientTls::none`]).
+    /// Whether no server is trusted ([`ClientTls::none`]).
     pub fn is_none(&self) -> bool {
         self.live.is_none()
     }
 
-    /// What was read last; `None` where no server is trusted.
+    /// The content read last; `None` if no server is trusted.
     fn current(&self) -> Option<Arc<ClientConfig>> {
         Some(self.live.as_ref()?.config.read().unwrap_or_else(PoisonError::into_inner).clone())
     }
@@ -205,7 +205,7 @@ fn client_config(authorities: &Path, shown: Option<&(PathBuf, PathBuf)>) -> Resu
     Ok(config)
 }
 
-/// What a server shows that has no config: the certificate that the environment names for clients, to clients of the same authority.
+/// TLS files of a server without a config: the client certificate that the environment names, for clients of the same authority.
 pub fn server_from_environment() -> Option<ServerTls> {
     let (cert, key) = (variable(CERT_VARIABLE)?, variable(KEY_VARIABLE)?);
     Some(ServerTls { cert, key, client_ca: variable(CA_VARIABLE)? })
@@ -215,17 +215,17 @@ fn variable(name: &str) -> Option<PathBuf> {
     std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from)
 }
 
-/// Files of a server and of a client that were read again, and are not in use yet.
+/// TLS files of a server and of a client that were read again and are not in use yet.
 #[must_use = "nothing changes before it is taken over"]
 pub struct Renewed {
     server: Option<(LiveServerTls, ServerConfig)>,
     client: Option<(Arc<LiveClientTls>, ClientConfig)>,
 }
 
-/// Reads the files of a server, where it has loaded them, and those of `client` again.
+/// Reads the files of a server, if it has loaded them, and those of `client` again.
 ///
 /// # Errors
-/// [`TlsError`] of the first that cannot be read or holds nothing usable.
+/// [`TlsError`] of the first file that cannot be read or holds nothing usable.
 pub fn read_again(server: Option<&LiveServerTls>, client: &ClientTls) -> Result<Renewed, TlsError> {
     let server = server.filter(|server| server.current().is_some());
     let server = server.map(|server| Ok((server.clone(), server.files.config()?))).transpose()?;
@@ -235,7 +235,7 @@ pub fn read_again(server: Option<&LiveServerTls>, client: &ClientTls) -> Result<
 }
 
 impl Renewed {
-    /// Every handshake from now on, of the server and of everybody who shares the client's handle, is with these.
+    /// Makes every handshake from now on use these files, for the server and for every clone of the client's handle.
     pub fn take_over(self) {
         if let Some((server, config)) = self.server {
             server.replace(config);

@@ -1,13 +1,13 @@
-//! Where the robot's own body is in a picture, by its kinematics.
+//! The robot's own body in a picture, by its kinematics.
 
 use ratn_motion::robot::{Configuration, Robot};
 use ratn_motion::spheres::Sphere;
 use ratn_perception::mask::Ball;
 
-/// Spheres around every moving part of the robot, in the world, in all postures that it had.
+/// Spheres around every moving part of the robot, in the world frame, for all postures during the picture.
 pub(super) fn balls(robot: &Robot, postures: &[Configuration]) -> Vec<Ball> {
     let nothing: &[Sphere] = &[];
-    // The top of the base's body is what things stand on: it hides nothing, and the spheres around it reach above it.
+    // Things stand on the top of the base's body: it hides nothing, and its spheres would reach above it.
     let is_deck = |link: usize| robot.body() == Some(link);
     let links = robot.model.links.iter().enumerate();
     let covers: Vec<&[Sphere]> = links.map(|(i, link)| if is_deck(i) { nothing } else { &link.spheres[..] }).collect();

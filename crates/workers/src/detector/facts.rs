@@ -1,6 +1,6 @@
-//! What a goal writes into the world of what was found: facts as measured, each with how sure it is.
+//! The facts about detected objects that a goal writes into the world: measured values, each with its uncertainty.
 //!
-//! The goal's input `measures` names them, because its state declares them as its effects: `at`, the pose with its covariance, and
+//! The goal's input `measures` names the predicates, because its state declares them as effects: `at`, the pose with its covariance, and
 //! `shape`, with the confidence that the object is of the class whose shape it is.
 
 use ratn_model::fact::{FactKey, Term};
@@ -10,7 +10,7 @@ use ratn_perception::detection::{Detection, Model};
 use ratn_worker::action::{ActionFailure, GoalContext, GoalOutcome};
 use ratn_world::scene::Shape;
 
-/// A predicate that is written.
+/// A predicate that can be written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Fact {
     At,
@@ -22,7 +22,7 @@ enum Fact {
 pub(super) struct Facts(Vec<Fact>);
 
 impl Facts {
-    /// None unless the goal says so.
+    /// The predicates in the goal's input; none without it.
     pub(super) fn of(goal: &GoalContext) -> Result<Facts, ActionFailure> {
         let Some(port) = goal.port("measures").optional() else { return Ok(Facts::default()) };
         let names = port.list()?.iter().map(|name| name.string()).collect::<Result<Vec<_>, _>>()?;
@@ -40,7 +40,7 @@ impl Facts {
         names.iter().map(known).collect::<Result<_, _>>().map(Facts)
     }
 
-    /// The outcome with what was measured of an object.
+    /// Adds the measured facts of an object to the outcome.
     pub(super) fn write(&self, outcome: GoalOutcome, id: &str, object: &Detection) -> GoalOutcome {
         self.0.iter().fold(outcome, |outcome, fact| {
             let key = |predicate: &str| FactKey {
@@ -61,7 +61,7 @@ impl Facts {
     }
 }
 
-/// The shape that a planner keeps clear of. For a hollow or thin object it is the shape around it.
+/// The shape that a planner avoids. For a hollow or thin object it is the enclosing shape.
 fn shape(model: &Model) -> Shape {
     match *model {
         Model::Round { radius, height, .. } => Shape::Cylinder { radius, length: height },

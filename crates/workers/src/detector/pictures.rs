@@ -1,4 +1,4 @@
-//! PNG files of what the detector saw and found, for people to look at; the oldest are overwritten.
+//! Saves pictures with their detections as PNG files, for people; the oldest are overwritten.
 
 use ratn_perception::camera::{Camera, DepthImage};
 use ratn_perception::detection::Detection;
@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// No detector keeps more.
+/// Maximum number of pictures that a detector keeps.
 const MAX_PICTURES: usize = 500;
 
-/// Where pictures go, if anywhere.
+/// The folder for pictures, if any.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Pictures(Option<Arc<Folder>>);
 
@@ -25,7 +25,7 @@ impl Pictures {
         Pictures(folder.map(|path| Arc::new(Folder { path, taken: AtomicUsize::new(0) })))
     }
 
-    /// Keeps a picture with what was found in it. A disk that is full is no reason not to detect.
+    /// Saves a picture with its detections. A full disk does not make the detection fail.
     pub(super) fn keep(&self, image: &DepthImage, camera: &Camera, found: &[Detection]) {
         let Some(folder) = &self.0 else { return };
         let number = folder.taken.fetch_add(1, Ordering::Relaxed) % MAX_PICTURES;

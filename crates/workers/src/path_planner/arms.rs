@@ -1,6 +1,6 @@
-//! Which arm of the robot moves, and where the others are: the optional inputs `arm` (its name; unless said, the only or first one) and
-//! `other_arms` (joints by the names of arms; an arm that is left out is in its posture `home`, else at zero). While the base drives, no arm
-//! moves: the first one is where the input `arm` says.
+//! Which arm of the robot moves, and the postures of the others: the optional inputs `arm` (its name; by default the only or first one) and
+//! `other_arms` (joint positions by arm name; an arm that is omitted is in its posture `home`, else at zero). While the base drives, no arm
+//! moves: the first arm is in the posture of the input `arm`.
 
 use ratn_model::value::Value;
 use ratn_motion::hands;
@@ -9,10 +9,11 @@ use ratn_worker::action::{ActionFailure, GoalContext};
 use ratn_world::scene::{Placement, Scene, SceneObject};
 use std::sync::Arc;
 
-/// With each held object the checks of every posture grow, those of which may press each other with the square.
+/// Maximum number of held objects: the checks of every posture grow with their number, and those of held objects against each other with
+/// its square.
 const MOST_HELD: usize = 64;
 
-/// The robot seen from the arm that moves.
+/// The robot with the moving arm selected.
 pub(super) fn moving(robot: &Arc<Robot>, goal: &GoalContext) -> Result<Arc<Robot>, ActionFailure> {
     let arm = goal.port("arm").optional().map(|port| port.string()).transpose()?;
     let others = goal.port("other_arms").optional();
@@ -23,7 +24,7 @@ pub(super) fn moving(robot: &Arc<Robot>, goal: &GoalContext) -> Result<Arc<Robot
     Ok(Arc::new(with_others(seen, goal)?))
 }
 
-/// The robot with the arms beside its first one where they are said to be.
+/// The robot with its other arms in their given postures.
 pub(super) fn standing(robot: &Arc<Robot>, goal: &GoalContext) -> Result<Arc<Robot>, ActionFailure> {
     match goal.port("other_arms").optional() {
         None => Ok(Arc::clone(robot)),
@@ -51,12 +52,12 @@ fn wrong(port: &str, fault: RobotFault) -> ActionFailure {
     ActionFailure::aborted(format!("input `{port}`: {fault}"))
 }
 
-/// The scene with what the arms hold in their hands: what the arm holds that moves, and what the others hold where they stand.
+/// The scene with the objects in the robot's hands: those of the moving arm move with it, those of the others stand still.
 pub(super) fn in_hands(robot: &Robot, scene: Arc<Scene>) -> Result<Arc<Scene>, ActionFailure> {
     with_hands(robot, scene, hands::seen_from)
 }
 
-/// The same where the base drives: what they all hold moves along.
+/// The same for a driving base: all held objects move along.
 pub(super) fn carried(robot: &Robot, scene: Arc<Scene>) -> Result<Arc<Scene>, ActionFailure> {
     with_hands(robot, scene, hands::carried_by)
 }

@@ -1,6 +1,6 @@
-//! What bounds a motion, read from the input ports of a goal: `keep_axis`, `keep_direction`, `keep_rad` and `inside` (what the tool keeps);
-//! `velocity_scale`, `acceleration_scale`, `jerk_scale` (fractions of the joints' limits: a number for all, or one for each joint);
-//! `tool_speed_m_s`, `tool_turning_rad_s`; `keep_out` (boxes into which nothing comes that moves, though there is nothing).
+//! The constraints of a motion, from the inputs of a goal: `keep_axis`, `keep_direction`, `keep_rad` and `inside` (constraints of the
+//! tool); `velocity_scale`, `acceleration_scale`, `jerk_scale` (fractions of the joints' limits: a number for all, or one per joint);
+//! `tool_speed_m_s`, `tool_turning_rad_s`; `keep_out` (boxes that no moving part may enter, though they are empty).
 
 use ratn_model::value::Value;
 use ratn_motion::joint_vector::JointVector;
@@ -8,7 +8,7 @@ use ratn_motion::keep::{Keep, KeptAxis, Region};
 use ratn_motion::tool_speed::ToolSpeed;
 use ratn_worker::action::{ActionFailure, GoalContext, Port};
 
-/// What the tool keeps.
+/// The constraint that the tool keeps.
 pub(super) fn keep(goal: &GoalContext) -> Result<Keep, ActionFailure> {
     let vector = |name: &str| goal.port(name).optional().map(|port| port.vector3()).transpose();
     let (axis, direction, tolerance) =
@@ -36,7 +36,7 @@ fn region(port: &Port<'_>) -> Result<Region, ActionFailure> {
     Ok(Region { pose: port.field("pose").pose()?, size: port.field("size").vector3()? })
 }
 
-/// For so many joints: fractions of the limits of velocity, acceleration and jerk.
+/// Fractions of the limits of velocity, acceleration and jerk, for this number of joints.
 pub(super) fn scales(goal: &GoalContext, joints: usize) -> Result<[JointVector; 3], ActionFailure> {
     let scale = |name| scale(goal, name, joints);
     Ok([scale("velocity_scale")?, scale("acceleration_scale")?, scale("jerk_scale")?])
@@ -58,7 +58,7 @@ fn scale(goal: &GoalContext, name: &str, joints: usize) -> Result<JointVector, A
     vector.ok_or_else(|| wrong(format!("has {count} numbers")))
 }
 
-/// How fast the tool may be.
+/// The limits of the tool's speed.
 pub(super) fn tool_speed(goal: &GoalContext) -> Result<ToolSpeed, ActionFailure> {
     let m_per_s = goal.optional_float("tool_speed_m_s")?;
     Ok(ToolSpeed { m_per_s, rad_per_s: goal.optional_float("tool_turning_rad_s")? })

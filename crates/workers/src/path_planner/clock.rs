@@ -1,4 +1,4 @@
-//! The planner's clock: when what was found will do, and when to stop. It leaves the processor to others where more planning hardly helps.
+//! The planner's clock: decides when a result is good enough, and when to stop. It yields the processor when more planning hardly helps.
 //!
 //! ```text
 //! search ─ first path ─ improvement that is worth waiting for ─┬─ stop: the result
@@ -14,44 +14,46 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// How long a first path is searched for at the most, in wall time, where the budget is shorter.
+/// Maximum wall time of the search for a first path, unless the budget is longer.
 const FIRST_PATH_LIMIT: Duration = Duration::from_secs(10);
 
-/// How long a path is improved at least where no budget is given, in wall time: the processor needs that, however fast the robot's time
-/// goes. After that it is improved as long as in the last stretch of that length the motion got quicker by more than the stretch took.
+/// Minimum wall time of improvement without a budget: the processor needs it, however fast robot time goes. After that, improvement goes on
+/// as long as the motion got quicker in the last interval of this length by more than the interval took.
 const IMPROVEMENT: Duration = Duration::from_millis(50);
 
-/// After this long without a quicker path the planner lets others have the processor between its iterations, …
+/// After this long without a quicker path, the planner yields the processor between its iterations, …
 const STAGNATION: Duration = Duration::from_millis(100);
 
 /// … for this long each time. Short, because a cancelled goal is noticed only afterwards.
 const PAUSE: Duration = Duration::from_millis(1);
 
-/// A result that was given is improved until there was no better one for as long as the last one took, but for this long at least …
+/// A published result is improved until there was no better one for as long as it took from the first to the last result, but for at least
+/// this long, …
 const STILL: Duration = Duration::from_secs(1);
 
-/// … and never for longer than this: somebody else may want the planner.
+/// … and never for longer than this: another goal may need the planner.
 const LONGEST: Duration = Duration::from_secs(20);
 
-/// Whoever waits for a first result comes before one that only gets better: its thread is this much nicer.
+/// Goals that wait for a first result have priority over goals that only improve one: this is added to the nice value of the latter's
+/// thread.
 const NICER: i32 = 10;
 
 pub(super) struct Clock {
     begin: Instant,
-    /// The robot's seconds per second of wall time.
+    /// Seconds of robot time per second of wall time.
     speed: f64,
     budget: Option<Duration>,
     first_path: Option<Duration>,
     /// When the path last became quicker.
     improved: Instant,
-    /// What the motion was estimated to take, and when: those of the last stretch and the one before them.
+    /// Estimated durations of the motion with their times: those of the last interval, and the one before it.
     estimates: VecDeque<(Duration, f64)>,
-    /// When results were given: the first and the last one.
+    /// Times of the first and the last published result.
     given: Option<(Duration, Duration)>,
     goal: Arc<GoalContext>,
 }
 
-/// In the robot's seconds.
+/// Times in seconds of robot time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Figures {
     /// From the goal's start to the first path.
@@ -62,13 +64,13 @@ pub(super) struct Figures {
 
 impl Clock {
     pub(super) fn new(begin: Instant, speed: f64, budget_s: Option<f64>, goal: Arc<GoalContext>) -> Clock {
-        // A budget too long for a duration is none that ends.
+        // A budget too long for a `Duration` never ends.
         let budget = budget_s.map(|s| Duration::try_from_secs_f64(s / speed).unwrap_or(Duration::MAX));
         let estimates = VecDeque::new();
         Clock { begin, speed, budget, first_path: None, improved: begin, estimates, given: None, goal }
     }
 
-    /// What the planner shall do now.
+    /// Tells the planner what to do next.
     pub(super) fn control(&mut self, progress: Progress<'_>) -> Control {
         if self.goal.cancelled.is_cancelled() {
             return Control::Cancelled;
@@ -90,7 +92,7 @@ impl Clock {
             Progress::Usable(plan) => {
                 self.improved = self.begin + elapsed;
                 if self.given.is_none() {
-                    // Only this thread: it ends with its goal. Where that is not allowed, it is as nice as before.
+                    // Only this thread, which ends with its goal. Without permission it keeps its nice value.
                     let _ = rustix::process::nice(NICER);
                 }
                 self.given = Some((self.given.map_or(elapsed, |(first, _)| first), elapsed));
@@ -120,13 +122,13 @@ impl Clock {
             (Some(first_path), None) if elapsed < first_path + IMPROVEMENT || self.is_worth_waiting(elapsed) => {
                 Control::Continue
             }
-            // Whoever says how long it may take wants it then, and no sooner.
+            // A goal with a budget wants its result when the budget is used up, and no sooner.
             (Some(_), None) if self.goal.improves().is_some() => Control::Settle,
             _ => Control::TimeUp,
         }
     }
 
-    /// Whether the motion got quicker in the last stretch by more than that took.
+    /// Whether the motion got quicker in the last interval by more than the interval took.
     fn is_worth_waiting(&mut self, elapsed: Duration) -> bool {
         let Some(before) = elapsed.checked_sub(IMPROVEMENT) else { return true };
         while self.estimates.get(1).is_some_and(|(at, _)| *at <= before) {

@@ -1,6 +1,6 @@
-//! `path_planner/drive`: a way for the base in the goal's projection. Inputs: `arm` (the posture that the arm is in), `goal` (a pose on
-//! the floor, or a list of such poses); optional `start`, `position_tolerance_m`, `heading_tolerance_rad`, `speed`, and `pan`, `tilt`, `width_m`,
-//! `other_arms`, `cloud` with what belongs to it as for `path_planner/plan`.
+//! `path_planner/drive`: plans a motion of the base in the goal's projection. Inputs: `arm` (the arm's posture), `goal` (a pose on the
+//! floor, or a list of such poses); optional `start`, `position_tolerance_m`, `heading_tolerance_rad`, `speed`, and `pan`, `tilt`,
+//! `width_m`, `other_arms`, and `cloud` with its parameters as for `path_planner/plan`.
 
 use super::arms;
 use super::goal::{Said, seen};
@@ -14,7 +14,7 @@ use ratn_world::scene::Scene;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// The fraction of the base's limits where the goal says none.
+/// Default fraction of the base's limits.
 const DEFAULT_SPEED: f64 = 0.5;
 
 /// The action `path_planner/drive`: plans a motion of the base.

@@ -1,9 +1,9 @@
-//! A goal of the path planner, read from its input ports: `start`, `goal` (joints, a pose, or a list of these); optional `depart_m`,
-//! `approach_m` (straight parts; with `…_direction` and `…_frame`, else straight up and straight down), `straight`, `way_points`, `blend_m`
-//! (between them straight lines of the tool, too), `upright_rad` (what points up in the tool stays so, at most this far off), `reaches_into`
-//! (names of hollow objects whose insides the fingers may enter on the straight parts), `cloud` (what a depth camera saw), `speed`, `budget_s`; `pan`, `tilt` and `width_m`
-//! (where head and fingers are, as `pan_tilt` and `gripper` say; what is not said is [`assumed`]: the head looks straight ahead, the fingers
-//! are around what is held, else open). What bounds the motion: `bounds`.
+//! A goal of the path planner, read from its inputs: `start`, `goal` (joints, a pose, or a list of these); optional `depart_m`,
+//! `approach_m` (straight parts; with `…_direction` and `…_frame`, by default straight up and straight down), `straight`, `way_points`,
+//! `blend_m` (straight lines of the tool between them, too), `upright_rad` (maximum tilt of the tool's axis that points up), `reaches_into`
+//! (names of hollow objects that the fingers may enter on the straight parts), `cloud` (points from a depth camera), `speed`, `budget_s`;
+//! `pan`, `tilt` and `width_m` (of head and fingers, as reported by `pan_tilt` and `gripper`; by default [`assumed`]: the head looks
+//! straight ahead, the fingers are around a held object, else open). Constraints of the motion: `bounds`.
 
 use super::bounds;
 use ratn_model::value::Value;
@@ -20,16 +20,16 @@ use ratn_worker::action::{ActionFailure, GoalContext};
 use ratn_world::scene::Scene;
 use std::sync::Arc;
 
-/// The fraction of the joints' limits where the goal says none.
+/// Default fraction of the joints' limits.
 const DEFAULT_SPEED: f64 = 0.3;
 
-/// A planner is not kept for longer by one goal, in the robot's seconds.
+/// Maximum budget of a goal, in seconds of robot time.
 const MOST_BUDGET_S: f64 = 86_400.0;
 
-/// The radius of the ball about a point that was seen, in metres, where the goal says none.
+/// Default radius of the ball around a measured point, in metres.
 const POINT_RADIUS_M: f64 = 0.01;
 
-/// Where head and fingers are, as far as it is said.
+/// Posture of arm, head and fingers, as far as given.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Said {
     arm: JointVector,
@@ -38,23 +38,23 @@ pub(super) struct Said {
     width_m: Option<f64>,
 }
 
-/// A request that waits for its scene.
+/// A request that still needs its scene.
 #[derive(Debug)]
 pub(super) struct Asked {
     said: Said,
-    /// Its start is not known yet.
+    /// The start is not set yet.
     request: Request,
 }
 
 impl Asked {
-    /// With the start in a scene.
+    /// Sets the start by a scene.
     pub(super) fn in_scene(self, robot: &Robot, scene: &Scene) -> Request {
         Request { start: self.said.in_scene(robot, scene), ..self.request }
     }
 }
 
 impl Said {
-    /// From the input ports `pan`, `tilt`, `width_m`, and that of the arm's posture.
+    /// From the inputs `pan`, `tilt`, `width_m`, and the one with the arm's posture.
     pub(super) fn read(goal: &GoalContext, robot: &Robot, arm_port: &str) -> Result<Said, ActionFailure> {
         let of_part = |port: &str, is_there: bool, lacks: &str| match goal.optional_float(port)? {
             Some(_) if !is_there => Err(ActionFailure::aborted(format!(
@@ -72,7 +72,7 @@ impl Said {
         })
     }
 
-    /// The whole robot; what is not said is assumed.
+    /// The configuration of the whole robot; missing values are assumed.
     pub(super) fn in_scene(self, robot: &Robot, scene: &Scene) -> Configuration {
         let assumed = assumed(robot, scene);
         Configuration {
@@ -85,7 +85,7 @@ impl Said {
     }
 }
 
-/// What is asked for, and the budget in the robot's seconds.
+/// The request, and the budget in seconds of robot time.
 pub(super) fn asked(goal: &GoalContext, robot: &Robot) -> Result<(Asked, Option<f64>), ActionFailure> {
     let budget_s = goal.optional_float("budget_s")?;
     if let Some(s) = budget_s
@@ -108,15 +108,15 @@ pub(super) fn asked(goal: &GoalContext, robot: &Robot) -> Result<(Asked, Option<
         seen: seen(goal)?,
         speed: goal.optional_float("speed")?.unwrap_or(DEFAULT_SPEED),
         seed: goal.seed,
-        // The clock says when improvement ends.
+        // The clock ends the improvement.
         improvement_iterations: usize::MAX,
-        // The start is known when the scene is.
+        // The start is set when the scene is known.
         ..Request::new(robot.at_zero(), goals(robot, goal.port("goal").any()?)?)
     };
     Ok((Asked { said: Said::read(goal, robot, "start")?, request }, budget_s))
 }
 
-/// A straight part by the ports `…_m`, `…_direction` and `…_frame`; `usual` is the part where no direction is said.
+/// A straight part from the inputs `…_m`, `…_direction` and `…_frame`; `usual` is the part without a direction.
 fn straight(goal: &GoalContext, which: &str, usual: fn(f64) -> Straight) -> Result<Straight, ActionFailure> {
     let port = |end: &str| format!("{which}_{end}");
     let length_m = goal.optional_float(&port("m"))?.unwrap_or(0.0);
@@ -133,7 +133,7 @@ fn straight(goal: &GoalContext, which: &str, usual: fn(f64) -> Straight) -> Resu
     }
 }
 
-/// Whether the tool goes in straight lines all the way, and through which poses.
+/// Whether the tool moves in straight lines all the way, and through which poses.
 fn way_points(goal: &GoalContext) -> Result<Option<WayPoints>, ActionFailure> {
     let straight = goal.port("straight").optional().map(|port| port.bool()).transpose()?;
     let blend_m = goal.optional_float("blend_m")?;
@@ -154,7 +154,7 @@ fn way_points(goal: &GoalContext) -> Result<Option<WayPoints>, ActionFailure> {
     }
 }
 
-/// What a depth camera saw: `cloud`, a PCD or PLY file with points in the world frame, with `cloud_radius_m` and `cloud_known_within_m`.
+/// Points from a depth camera: `cloud`, a PCD or PLY file with points in the world frame, with `cloud_radius_m` and `cloud_known_within_m`.
 pub(super) fn seen(goal: &GoalContext) -> Result<Option<Seen>, ActionFailure> {
     let radius_m = goal.optional_float("cloud_radius_m")?.unwrap_or(POINT_RADIUS_M);
     let known_within_m = goal.optional_float("cloud_known_within_m")?.unwrap_or(KNOWN_WITHIN_M);

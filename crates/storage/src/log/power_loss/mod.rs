@@ -1,12 +1,12 @@
-//! A disk that loses power: what was not synced, of files and of directories, may be there after it, or not, or in part.
+//! A simulated disk that loses power: unsynced changes of files and of directories may be there after it, or not, or in part.
 //!
 //! ```text
 //!   log ──▶ PowerLossDisk ──▶ the real directory, which the running log reads
 //!               └── every step, in order ──▶ after(steps so far, dice) ──▶ a directory as the disk may have it then
 //! ```
-//! The model is harder than a disk is. Of writes since a file's last sync each is kept, dropped or torn, in pieces of [`PIECE`] bytes and
-//! whatever their order. Of changes of names since a directory's last sync any may be missing; a sync of a file makes no name durable.
-//! What it does not do: damage bytes that were synced.
+//! The model is harsher than a real disk. Of the writes since a file's last sync each is kept, dropped or torn, in pieces of [`PIECE`]
+//! bytes and in any order. Of the renames and removals since a directory's last sync any may be missing; syncing a file makes no name
+//! durable. The model does not damage bytes that were synced.
 
 mod steps;
 mod tests;
@@ -17,13 +17,13 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// A write is torn between pieces of so many bytes.
+/// A write is torn between pieces of this many bytes.
 pub(super) const PIECE: usize = 8;
 
-/// A file or a directory, whatever its name.
+/// The number of a file or a directory, independent of its name.
 pub(super) type Node = usize;
 
-/// What was done to the disk, and what was promised meanwhile.
+/// An operation on the disk, or a promise that was made.
 #[derive(Debug, Clone)]
 pub(super) enum Step {
     Write {
@@ -53,12 +53,12 @@ pub(super) enum Step {
         name: String,
     },
     SyncDirectory(Node),
-    /// Everything of this log through this position was acknowledged.
+    /// Everything in this log through this position was acknowledged.
     Acknowledged {
         log: &'static str,
         through: u64,
     },
-    /// The copy was said to be made.
+    /// The copy was reported as complete.
     Copied {
         log: &'static str,
         through: u64,
@@ -68,17 +68,17 @@ pub(super) enum Step {
 #[derive(Debug, Default)]
 struct Recorded {
     steps: Vec<Step>,
-    /// Every name there is now.
+    /// All present names.
     names: BTreeMap<PathBuf, Node>,
     nodes: Node,
 }
 
-/// See the module. Clones are the same.
+/// See the module. Clones share one disk.
 #[derive(Debug, Clone)]
 pub(super) struct PowerLossDisk {
     root: PathBuf,
     recorded: Arc<Mutex<Recorded>>,
-    /// Held by a test to keep a sync of records from ending; those with which a segment begins and ends go on.
+    /// Locked by a test to keep syncs of records from ending; the syncs that begin and end a segment go on.
     pub(super) busy: Arc<Mutex<()>>,
 }
 
@@ -87,14 +87,14 @@ struct RecordedFile {
     disk: PowerLossDisk,
     node: Node,
     end: usize,
-    /// It holds records that were not synced, and goes on.
+    /// The file is a segment with unsynced records.
     has_records: bool,
     begun: bool,
     file: Box<dyn LogFile>,
 }
 
 impl PowerLossDisk {
-    /// Of a directory that is empty. Its own name is durable.
+    /// A disk for an empty directory, whose own name is durable.
     pub(super) fn of(root: &Path) -> PowerLossDisk {
         let disk = PowerLossDisk { root: root.to_owned(), recorded: Arc::default(), busy: Arc::default() };
         disk.recorded().names.insert(root.to_owned(), 0);
@@ -109,7 +109,7 @@ impl PowerLossDisk {
         self.recorded().steps.clone()
     }
 
-    /// How many writes there were.
+    /// Number of writes so far.
     pub(super) fn writes(&self) -> usize {
         self.recorded().steps.iter().filter(|step| matches!(step, Step::Write { .. })).count()
     }
@@ -118,7 +118,7 @@ impl PowerLossDisk {
         self.recorded.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The directory that holds a name, and the name in it.
+    /// The directory that contains a path, and the name in it.
     fn place(&self, path: &Path) -> (Node, String) {
         let parent = path.parent().unwrap_or(&self.root);
         let directory = self.recorded().names.get(parent).copied();

@@ -1,11 +1,11 @@
-//! The contents of the disk after some of the steps and a loss of power.
+//! Reconstructs the contents of the disk after some of the steps and a loss of power.
 
 use super::{Node, PIECE, Step};
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-/// Numbers from a seed (Steele et al. 2014, SplitMix64).
+/// Random numbers from a seed (Steele et al. 2014, SplitMix64).
 #[derive(Debug)]
 pub(super) struct Dice(pub(super) u64);
 
@@ -19,14 +19,14 @@ impl Dice {
     }
 }
 
-/// What becomes of what was not synced.
+/// What happens to unsynced changes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Fate {
-    /// All of it is there.
+    /// All are there.
     Kept,
-    /// Nothing is.
+    /// None is there.
     Lost,
-    /// Of everything by itself: there, not there, or in part.
+    /// Decided for each change: there, not there, or in part.
     Mixed,
 }
 
@@ -61,7 +61,7 @@ struct Platter {
     directories: BTreeMap<Node, Directory>,
 }
 
-/// Makes at `target` what the disk has after these steps and a loss of power.
+/// Creates at `target` the contents of the disk after these steps and a loss of power.
 pub(super) fn after(steps: &[Step], fate: Fate, dice: &mut Dice, target: &Path) {
     let mut platter = Platter::default();
     platter.directories.insert(0, Directory::default());

@@ -1,4 +1,4 @@
-//! Power is lost after every step of a log's life: made, written, begun anew, compacted, closed, opened, copied.
+//! Tests a loss of power after every step in a log's life: created, written, next segment, compacted, closed, opened, copied.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use super::steps::{Dice, Fate, after};
@@ -10,7 +10,7 @@ use std::io;
 use std::path::Path;
 use std::sync::Arc;
 
-/// What the record at a position says.
+/// The payload of the record at a position.
 fn payload(position: u64) -> Vec<u8> {
     let length = usize::try_from(position * 37 % 90).unwrap();
     format!("record {position} {}", "x".repeat(length)).into_bytes()
@@ -40,7 +40,7 @@ impl Life {
         assert_eq!(self.writer.append(&payload(position)).unwrap(), Position(position));
     }
 
-    /// Appends, and waits for each to be acknowledged.
+    /// Appends records, and waits for each to be acknowledged.
     fn acknowledged(&mut self, positions: std::ops::RangeInclusive<u64>) {
         for position in positions {
             self.append(position);
@@ -48,7 +48,7 @@ impl Life {
         }
     }
 
-    /// Appends the first, and then the others in one frame.
+    /// Appends the first record, and then the others in one frame.
     fn together(&mut self, positions: std::ops::RangeInclusive<u64>) {
         let (first, last, writes) = (*positions.start(), *positions.end(), self.disk.writes());
         let busy = self.disk.busy.clone();
@@ -81,7 +81,7 @@ impl Life {
     }
 }
 
-/// Everything that a log goes through.
+/// Runs a log through all of its operations.
 fn live(root: &Path, durability: Durability) -> Vec<Step> {
     let disk = PowerLossDisk::of(root);
     let mut life = Life::open(&disk, root, "log", durability);
@@ -107,7 +107,7 @@ fn live(root: &Path, durability: Durability) -> Vec<Step> {
     disk.steps()
 }
 
-/// What is read is what was written, and holds all that was promised.
+/// Checks that the records read are those written, and contain everything that was acknowledged.
 fn check(recovered: &Recovered, promised: u64) {
     let through = recovered.snapshot.as_ref().map_or(0, |snapshot| snapshot.through.0);
     if let Some(found) = &recovered.snapshot {
@@ -119,7 +119,7 @@ fn check(recovered: &Recovered, promised: u64) {
     assert!(recovered.last().0 >= promised, "{promised} was acknowledged, and {} is there", recovered.last());
 }
 
-/// Opens what is left, goes on with it, and opens it again.
+/// Opens the remaining log, continues it, and opens it again.
 fn recovers(place: &Path, promised: u64, durability: Durability) {
     let log = Log::new(place, options(durability)).on(Arc::new(Unsynced));
     let (recovered, mut writer) = log.open().unwrap();
@@ -132,7 +132,7 @@ fn recovers(place: &Path, promised: u64, durability: Durability) {
     drop(writer);
 }
 
-/// A disk that does not lose power again: nothing has to be synced.
+/// File operations without syncs: the power is not lost again.
 #[derive(Debug)]
 struct Unsynced;
 
@@ -167,7 +167,7 @@ impl LogFile for UnsyncedFile {
     }
 }
 
-/// In each of these ways at every step.
+/// Loses power at every step, with each of these fates.
 fn lose_power_at_every_step(durability: Durability, seed: u64, fates: &[Fate]) -> usize {
     let root = tempfile::tempdir().unwrap();
     let steps = live(root.path(), durability);
@@ -190,7 +190,7 @@ fn lose_power_at_every_step(durability: Durability, seed: u64, fates: &[Fate]) -
                 recovers(&left.path().join("log"), log, durability);
                 for (name, promised) in [("backup", backup), ("restored", restored)] {
                     let place = left.path().join(name);
-                    // There is a whole copy, or none.
+                    // There is a complete copy, or none.
                     assert!(promised.is_none() || place.is_dir(), "{name} is gone");
                     if place.is_dir() {
                         recovers(&place, promised.unwrap_or(24), durability);

@@ -1,24 +1,24 @@
-//! The state machine of emergency stop and hold. Pure: calls, answers of the brakes and of the disk in; commands out.
+//! The state machine of emergency stop and hold. Pure: calls and results of the brakes and of the disk in, commands out.
 //!
 //! ```text
 //!             stop, hold                                          clear, go on
-//!  ready ───────────────────▶ held, stopped: brakes applied ◀───▶ latch removed ─▶ brakes let go ─▶ ready
+//!  ready ───────────────────▶ held, stopped: brakes applied ◀───▶ latch removed ─▶ brakes released ─▶ ready
 //!                              │  ▲                                      │               │
 //!                              └──┘ asked again, not confirmed           └─ stop, hold ──┴─▶ brakes applied again
 //! ```
-//! - A stop or a hold is in force at once. The brakes, and the disk, follow; it is confirmed when both have done it.
-//! - A stop or a hold that is asked for again has done again whatever is not confirmed.
-//! - A stop or a hold ends whatever the brakes are doing for another state. Clearing and going on never do: they are refused until the
-//!   brakes have answered.
-//! - An application that was superseded may have worked until it was over. So what was applied meanwhile is applied once more after that,
+//! - A stop or a hold is in force at once. The brakes, and the disk, follow; the call is confirmed when both have succeeded.
+//! - A repeated call for a stop or a hold repeats whatever is not confirmed.
+//! - A stop or a hold interrupts whatever the brakes are doing for another state. Clearing and going on never do: they are refused until
+//!   the brakes have answered.
+//! - A superseded application of the brakes may have had an effect until it was over. So the newer state is applied once more after that,
 //!   and only then confirmed.
-//! - Nothing waits for its caller: what has begun goes on when the caller is gone.
+//! - No operation depends on its caller: what has begun goes on when the caller is gone.
 
 use super::{SafetyError, SafetyState};
 use std::collections::BTreeSet;
 use tokio::time::{Duration, Instant};
 
-/// Brakes that have not answered for so long are asked anew when a stop or a hold is asked for again.
+/// If the brakes have not answered for this long, a repeated call for a stop or a hold applies them anew.
 pub(super) const BRAKES_PATIENCE: Duration = Duration::from_secs(3);
 
 /// A caller who waits for an answer.
@@ -29,7 +29,7 @@ pub(super) struct Call(pub(super) u64);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Application(pub(super) u64);
 
-/// What a caller wants.
+/// The operation that a caller asks for.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Question {
     Stop {
@@ -40,7 +40,7 @@ pub(super) enum Question {
         reason: String,
     },
     GoOn,
-    /// That nothing moves any more of what a process before this one may have begun.
+    /// Bring the driver to rest: end motions that an earlier process may have begun.
     Rest,
 }
 
@@ -50,30 +50,30 @@ pub(super) enum Event {
         call: Call,
         question: Question,
     },
-    /// The caller does not wait any more.
+    /// The caller no longer waits.
     Left {
         call: Call,
     },
-    /// An application of the brakes is over. One that was dropped also comes to an end.
+    /// An application of the brakes is over; a dropped one also gets this event.
     Braked {
         application: Application,
         result: Result<(), String>,
     },
-    /// The stop is on the disk, or is not.
+    /// The stop has been written to the disk, or the write failed.
     Latched(Result<(), String>),
-    /// The stop is gone from the disk, or may not be.
+    /// The stop has been removed from the disk, or the removal failed and the stop may still be there.
     Unlatched(Result<(), String>),
 }
 
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Command {
-    /// This is in force.
+    /// Publish this state as the one in force.
     Show(SafetyState),
     Apply {
         application: Application,
         state: SafetyState,
     },
-    /// Its result does not matter any more; that it is over does.
+    /// Drop the application: its result does not matter any more, but its end does.
     Drop {
         application: Application,
     },
@@ -90,10 +90,10 @@ pub(super) enum Command {
 /// See the module.
 #[derive(Debug, Clone)]
 pub(super) struct Machine {
-    /// What is in force.
+    /// The state in force.
     state: SafetyState,
     brakes: BrakesPhase,
-    /// `None` where a stop is kept nowhere.
+    /// `None` if stops are not kept on disk.
     latch: Option<LatchPhase>,
     /// Applications that are not over.
     running: BTreeSet<Application>,
@@ -105,17 +105,17 @@ pub(super) struct Machine {
 enum BrakesPhase {
     /// The brakes have confirmed the state in force.
     Confirmed,
-    /// They have not, and nothing is under way.
+    /// The brakes have not confirmed the state in force, and no application is under way for it.
     Failed { reason: String },
-    /// They are told the state in force. `alone`: nothing else was running when this began.
+    /// The state in force is being applied. `alone`: no other application was running when this one began.
     Applying { application: Application, since: Instant, alone: bool },
-    /// They have done so while an application before was not over.
+    /// The state in force was applied while an earlier application was not over.
     Overlapped,
-    /// Nothing is asked of them before the stop is gone from the disk.
+    /// The stop is being removed from the disk; the brakes are not told to release before that.
     Unlatching,
-    /// They are told to let go. `rested`: after [`BrakesPhase::Resting`].
+    /// The brakes are being released. `rested`: after [`BrakesPhase::Resting`].
     LettingGo { application: Application, rested: bool },
-    /// They end what a process before this one may have begun, while nothing is in force. Then they let go.
+    /// While no stop or hold is in force, the brakes end motions that an earlier process may have begun. Then they are released.
     Resting { application: Application },
 }
 
@@ -129,7 +129,7 @@ enum LatchPhase {
 }
 
 impl Machine {
-    /// Ready; a stop is kept on the disk where `is_kept`.
+    /// A machine in the state ready; `is_kept`: stops are kept on disk.
     pub(super) fn new(is_kept: bool) -> Machine {
         Machine {
             state: SafetyState::Ready,
@@ -141,7 +141,7 @@ impl Machine {
         }
     }
 
-    /// Stopped, as the disk says; the brakes have not been told.
+    /// A machine with a stop that the disk holds; the brakes have not been told yet.
     pub(super) fn stopped_before(reason: String) -> Machine {
         let reason_of_brakes = "they have not been asked yet".to_owned();
         Machine {
@@ -152,7 +152,7 @@ impl Machine {
         }
     }
 
-    /// What is in force.
+    /// The state in force.
     #[cfg(test)]
     pub(super) fn state(&self) -> &SafetyState {
         &self.state
@@ -196,7 +196,7 @@ impl Machine {
         self.write_latch(commands);
     }
 
-    /// Has done again whatever is not confirmed, and not under way.
+    /// Repeats whatever is neither confirmed nor under way.
     fn insist(&mut self, now: Instant, commands: &mut Vec<Command>) {
         match self.brakes {
             BrakesPhase::Confirmed => {}
@@ -205,13 +205,13 @@ impl Machine {
         }
     }
 
-    /// Has the brakes make the state in force true, whatever they are doing.
+    /// Applies the state in force, whatever the brakes are doing.
     fn apply(&mut self, now: Instant, commands: &mut Vec<Command>) {
         let alone = self.running.is_empty();
         commands.extend(self.running.iter().map(|&application| Command::Drop { application }));
         let application = self.begin(self.state.clone(), commands);
         self.brakes = BrakesPhase::Applying { application, since: now, alone };
-        // Whoever wanted to let go does not get that.
+        // Callers that wait for a release are refused.
         let refused = match &self.state {
             SafetyState::Stopped { reason } => SafetyError::Stopped { reason: reason.clone() },
             state => SafetyError::NotConfirmed { state: state.clone() },
@@ -236,7 +236,7 @@ impl Machine {
 
     fn asked_to_release(&mut self, call: Call, question: Question, commands: &mut Vec<Command>) {
         let refusal = match (&question, &self.state) {
-            // Nothing to release, unless the brakes did not let go after the start.
+            // There is nothing to release, unless the brakes failed to release after the start.
             (_, SafetyState::Ready) if !matches!(self.brakes, BrakesPhase::Failed { .. }) => {
                 Some(Ok(SafetyState::Ready))
             }
@@ -252,7 +252,7 @@ impl Machine {
         }
         let is_disk_busy = matches!(self.latch, Some(LatchPhase::Writing | LatchPhase::Removing));
         match self.brakes {
-            // Another caller has begun it.
+            // Another caller has begun the release.
             BrakesPhase::Unlatching | BrakesPhase::LettingGo { .. } => {}
             BrakesPhase::Confirmed | BrakesPhase::Failed { .. } if self.running.is_empty() && !is_disk_busy => {
                 self.release(commands);
@@ -266,7 +266,7 @@ impl Machine {
         self.calls.push((call, question));
     }
 
-    /// The stop is removed from the disk before anything may move.
+    /// Removes the stop from the disk first; only then may anything move.
     fn release(&mut self, commands: &mut Vec<Command>) {
         match &mut self.latch {
             Some(latch) if matches!(self.state, SafetyState::Stopped { .. }) => {
@@ -302,7 +302,7 @@ impl Machine {
                 Err(reason) if self.state == SafetyState::Ready => self.rest_failed(reason, commands),
                 Err(reason) => {
                     self.answer(&Err(SafetyError::Brakes(reason)), commands, is_release);
-                    // They may have let go halfway.
+                    // The brakes may have been released partly.
                     self.apply(now, commands);
                     self.write_latch(commands);
                 }
@@ -329,7 +329,7 @@ impl Machine {
     }
 
     fn unlatched(&mut self, now: Instant, result: Result<(), String>, commands: &mut Vec<Command>) {
-        // Removed and not synced it may be there again, or not.
+        // A removal without sync: the file may be there again after a crash, or not.
         self.latch = Some(LatchPhase::NotOnDisk);
         match (&self.brakes, result) {
             (BrakesPhase::Unlatching, Ok(())) => self.let_go(false, commands),
@@ -343,7 +343,7 @@ impl Machine {
         }
     }
 
-    /// Has a stop that is in force written to the disk, unless it is there, or on its way.
+    /// Writes a stop that is in force to the disk, unless it is there already or being written.
     fn write_latch(&mut self, commands: &mut Vec<Command>) {
         let is_being_released = matches!(self.brakes, BrakesPhase::Unlatching | BrakesPhase::LettingGo { .. });
         if let (SafetyState::Stopped { reason }, Some(latch), false) = (&self.state, &mut self.latch, is_being_released)
@@ -354,7 +354,7 @@ impl Machine {
         }
     }
 
-    /// Answers those who wait for what is in force, as far as that is decided.
+    /// Answers the callers that wait for the state in force, as far as the result is known.
     fn answer_those_in_force(&mut self, commands: &mut Vec<Command>) {
         if self.state == SafetyState::Ready {
             return;

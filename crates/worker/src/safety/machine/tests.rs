@@ -1,5 +1,5 @@
-//! The machine beside brakes and a disk that answer at any time, or not, and callers who leave: every sequence of a few steps, and random
-//! long ones. The oracle knows nothing of the machine but its commands: it works out when the brakes surely are in a state.
+//! Tests of the machine with brakes and a disk that answer at any time, or not, and callers who leave: every short sequence of steps, and
+//! long random ones. The oracle sees only the machine's commands, and derives from them in which state the brakes surely are.
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
@@ -8,18 +8,18 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use std::collections::BTreeMap;
 
-/// Every sequence of so many steps is tried.
+/// Length of the sequences that are tried exhaustively.
 const DEPTH: usize = 5;
-/// Random sequences, and the steps of each.
+/// Number of random sequences, and the steps of each.
 const WALKS: u64 = 3_000;
 const WALK_STEPS: usize = 60;
 
 #[derive(Debug, Clone)]
 struct Running {
     state: SafetyState,
-    /// The machine does not care for its result any more.
+    /// The machine ignores its result.
     dropped: bool,
-    /// No application for another state was running since it began.
+    /// No application for another state has been running since it began.
     undisturbed: bool,
 }
 
@@ -29,11 +29,11 @@ struct Bench {
     now: Instant,
     is_kept: bool,
     running: BTreeMap<Application, Running>,
-    /// The state in which the brakes surely are.
+    /// The state in which the brakes surely are, if known.
     surely: Option<SafetyState>,
-    /// They surely were in a state in which nothing moves.
+    /// Whether the brakes surely were in a state in which nothing moves.
     rested: bool,
-    /// What is being done on the disk: true for writing.
+    /// The operation on the disk that is under way: true for writing.
     writing: Option<bool>,
     on_disk: bool,
     shown: SafetyState,
@@ -118,7 +118,7 @@ impl Bench {
             }
             Step::Disk(done) => {
                 let writing = self.writing.take().unwrap();
-                // What was removed without success may be there or not.
+                // After a failed removal the file may be there or not.
                 self.on_disk = writing && done;
                 let result = if done { Ok(()) } else { Err("full".to_owned()) };
                 if writing { Event::Latched(result) } else { Event::Unlatched(result) }
@@ -239,7 +239,7 @@ fn so_it_is_in_long_sequences() {
             let chosen = random.random_range(0..steps.len());
             bench.take(steps.swap_remove(chosen));
         }
-        // Once everything is answered, nobody waits.
+        // When everything has been answered, no caller waits.
         while let Some(step) =
             bench.steps().into_iter().find(|step| matches!(step, Step::Brake(_, true) | Step::Disk(true)))
         {
@@ -259,7 +259,7 @@ fn brakes_that_hang_are_asked_anew_by_who_asks_again_later_and_not_by_who_asks_a
     bench.take(Step::Wait);
     bench.take(stop());
     assert_eq!(bench.running.values().map(|running| running.dropped).collect::<Vec<_>>(), [true, false]);
-    // Of the second nothing is confirmed while the first may still be at work.
+    // The second application is not confirmed while the first may still have an effect.
     bench.take(Step::Brake(Application(2), true));
     assert_eq!(bench.open.len(), 3);
     bench.take(Step::Brake(Application(1), false));
@@ -280,7 +280,7 @@ fn clearing_and_going_on_wait_for_nothing_and_end_nothing() {
     bench.take(Step::Disk(true));
     bench.take(Step::Ask(Question::Clear));
     assert_eq!(bench.writing, Some(false));
-    // A stop while it is being cleared.
+    // A stop while the earlier one is being cleared.
     bench.take(Step::Ask(Question::Stop { reason: "another".to_owned() }));
     bench.take(Step::Disk(true));
     assert_eq!(bench.writing, Some(true), "written again");
