@@ -11,7 +11,7 @@ use ratn_model::value::Value;
 /// The number of states that wait and of routines with waits inside: sensing nodes behind them run after the wait.
 pub(crate) const WAITS: Predicate = 1;
 
-/// The shared facts that regions beside a waiting state may write, with unknown values; [`Effects::Unknown`] if such a region may write
+/// The shared facts that regions beside a waiting state may write, with unknown values; `Unknown` if such a region may write
 /// any fact.
 pub(super) fn awaited(subject: &Subject<'_>) -> Effects {
     if !subject.is_node || !subject.contained.iter().any(|state| state.is_pause()) {

@@ -1,8 +1,8 @@
 //! The keys that a state writes: the index of memory renaming.
 //!
 //! Most effects name the key of their fact by literals and loop variables, so the key is known when the state is expanded, and never
-//! changes. Such a writer is in the chain of that key, and a reader of another key of the predicate never meets it. A writer whose
-//! keys are not known then is in the chain of the whole predicate.
+//! changes. Such a writer is in the chain of that key, and a reader of another key never meets it. Writers whose keys are not known
+//! then are in one chain of their predicate, which every reader of the predicate visits.
 
 use super::{Names, Plan, Predicate};
 use ratn_model::expression::{EffectExpr, FactExpr, Scope};
