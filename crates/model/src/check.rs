@@ -83,7 +83,6 @@ pub(crate) fn check(program: &Program, catalogue: &Catalogue, said: &Said<'_>, f
 }
 
 impl<'a> Subject<'a> {
-    /// The location of a part of a state in the file.
     pub(crate) fn place(&self, state: &State, part: &str) -> Location {
         self.places.of(state.id, part, state.location)
     }

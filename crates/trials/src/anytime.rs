@@ -17,7 +17,6 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// The cost of a result, less is better; an input of a motion is named by this and a number.
 pub(super) const COST: &str = "cost";
-/// Cost of the first result.
 const FIRST_COST: i64 = 100;
 
 /// Makes some computing actions anytime, and passes the costs of their results on to others.

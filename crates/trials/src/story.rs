@@ -94,7 +94,6 @@ struct Life {
     reused: bool,
 }
 
-/// The story of a run from its log.
 pub(super) fn story(program: &Program, run: &Run) -> Story {
     let mut lives: BTreeMap<InstanceId, Life> = BTreeMap::new();
     let mut running: Vec<usize> = Vec::new();

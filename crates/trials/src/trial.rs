@@ -247,12 +247,10 @@ fn given<'a>(
     }
 }
 
-/// The default values of the parameters.
 fn parameters(program: &Program) -> BTreeMap<String, Value> {
     program.parameters.iter().filter_map(|p| Some((p.name.clone(), p.default.clone()?))).collect()
 }
 
-/// The oracle under these conditions.
 pub(super) fn oracle<'a>(program: &'a Program, conditions: &Conditions) -> HashOracle<'a> {
     HashOracle {
         program,

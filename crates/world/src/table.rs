@@ -358,7 +358,6 @@ impl Bytes {
     }
 }
 
-/// The hash of a key.
 pub(crate) fn hash_of(key: &FactKey) -> u64 {
     let mut hasher = KeyHasher::default();
     key.hash(&mut hasher);

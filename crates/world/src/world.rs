@@ -289,7 +289,6 @@ impl World {
         Ok(world)
     }
 
-    /// Moves the overlay into the store.
     fn store_overlay(&mut self) {
         for (key, fact) in std::mem::take(&mut self.overlay) {
             match fact {

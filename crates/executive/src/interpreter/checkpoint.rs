@@ -57,7 +57,6 @@ impl Interpreter {
         }
     }
 
-    /// Sets the world of its projection.
     pub(crate) fn set_projection(&mut self, projection: World) {
         if let Target::Projection { world, .. } = &mut self.target {
             *world = projection;
@@ -65,7 +64,6 @@ impl Interpreter {
     }
 }
 
-/// The changes that turn the root into the world.
 pub(crate) fn difference(root: &World, world: &World) -> Vec<Change> {
     let mut changes = Vec::new();
     let (mut root, mut world) = (root.iter().peekable(), world.iter().peekable());

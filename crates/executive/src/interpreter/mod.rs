@@ -299,7 +299,6 @@ impl Interpreter {
         self.in_circles.is_some()
     }
 
-    /// The outputs of the states that it has executed.
     pub(crate) fn outputs(&self) -> &BTreeMap<StateId, Outputs> {
         &self.outputs
     }

@@ -57,7 +57,6 @@ impl Interpreter {
         }
     }
 
-    /// Whether all of these regions have ended.
     pub(super) fn have_ended(&self, regions: &[u64]) -> bool {
         regions.iter().all(|region| self.region_end(*region).is_some())
     }

@@ -113,7 +113,6 @@ impl Current {
     }
 }
 
-/// Number of units that a resource line wants.
 fn units_of(line: &ResourceExpr) -> usize {
     line.count.units() as usize
 }

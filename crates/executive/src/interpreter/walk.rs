@@ -345,7 +345,6 @@ impl Interpreter {
         }
     }
 
-    /// Follows the outcome of a state that has ended.
     fn follow(&mut self, context: &mut Context<'_>, id: u64, state: StateId, outcome: String, reason: String) {
         self.end_routine(context, id, state, &outcome);
         if self.goes_on_out(context, id, state, &outcome, &reason) {

@@ -93,13 +93,11 @@ impl Disjunctive {
         self.measure();
     }
 
-    /// The task before another one on its machine.
     pub(super) fn machine_before(&self, task: u32) -> u32 {
         let (machine, position) = (self.machine[task as usize], self.position[task as usize]);
         if machine == NONE || position == 0 { NONE } else { self.orders[machine as usize][position as usize - 1] }
     }
 
-    /// The task behind another one on its machine.
     pub(super) fn machine_behind(&self, task: u32) -> u32 {
         let (machine, position) = (self.machine[task as usize], self.position[task as usize]);
         let order = if machine == NONE { None } else { self.orders.get(machine as usize) };

@@ -62,7 +62,6 @@ impl Lanes {
         words
     }
 
-    /// Free amounts as words.
     pub(super) fn free(&self, amounts: &[u64]) -> Vec<u64> {
         let mut words = self.guards.clone();
         for (lane, amount) in self.lanes.iter().zip(amounts) {

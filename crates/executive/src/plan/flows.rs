@@ -57,7 +57,6 @@ pub(super) fn assigns(subject: &Subject<'_>) -> BTreeSet<String> {
     subject.state.assign.iter().map(|(name, _)| name).chain(inner).cloned().collect()
 }
 
-/// The states whose outputs the program reads anywhere.
 pub(super) fn read_anywhere(program: &Program) -> BTreeSet<StateId> {
     let all = program.states.iter().flat_map(|state| program.expressions(state));
     all.filter(|(slot, _)| *slot != Slot::Shared).flat_map(|(_, expression)| expression.flows()).collect()

@@ -143,7 +143,6 @@ pub(crate) struct StatePlan {
 }
 
 impl Plan {
-    /// The plan of a checked program.
     pub(crate) fn of(program: &Program) -> Plan {
         let mut names = Names::default();
         let transitions = outcomes::Transitions::of(program);
@@ -166,7 +165,6 @@ impl Plan {
         plan
     }
 
-    /// The plan of one state.
     pub(crate) fn state(&self, id: StateId) -> &StatePlan {
         &self.states[index(id)]
     }

@@ -169,7 +169,6 @@ fn arms(state: &State, outcomes: &[String], targets: &[Target], effects: &[Effec
     arms
 }
 
-/// The predicates that effects write.
 fn predicates(effects: &Effects, names: &mut Names) -> BTreeSet<Predicate> {
     match effects {
         Effects::Unknown => BTreeSet::from([EVERYTHING]),

@@ -111,7 +111,6 @@ impl Window {
         self.growth.unroll(&self.graph, context, id, elements);
     }
 
-    /// Decides the outcome of a join.
     pub(super) fn decide_join(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.revise(context);
         let Some(instance) = self.graph.get(id) else { return };

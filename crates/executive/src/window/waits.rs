@@ -112,7 +112,6 @@ impl WaitCell {
         self.wait
     }
 
-    /// The instances that wait for this one.
     pub(crate) fn waiters(&self) -> &[InstanceId] {
         &self.waiters
     }

@@ -66,7 +66,6 @@ impl Scope for Defaults<'_> {
     }
 }
 
-/// Whether a state binds a variable of this name.
 fn binds(state: &State, name: &str) -> bool {
     let of_loop = match &state.kind {
         StateKind::ForEach { variable, index, .. } => variable == name || index.as_deref() == Some(name),

@@ -102,7 +102,6 @@ impl Set {
 }
 
 impl ControlFlow {
-    /// The control flow of a program.
     pub(crate) fn of(program: &Program) -> ControlFlow {
         let outcomes = program.all_outcomes();
         let ports = Ports::of(program, &outcomes);
@@ -258,7 +257,6 @@ impl ControlFlow {
         seen[goal.index()] & 1 == 0
     }
 
-    /// The outcomes of a state.
     pub(crate) fn outcomes(&self, id: StateId) -> &[String] {
         &self.outcomes[id.0 as usize]
     }

@@ -80,7 +80,6 @@ fn written(wanted: &Type, program: &Program, expr: &Expr) -> String {
     }
 }
 
-/// The type of a value.
 pub(crate) fn of_value(value: &Value) -> Type {
     match value {
         Value::Null => Type::Any,

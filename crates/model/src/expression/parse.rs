@@ -694,7 +694,6 @@ impl Parser<'_> {
     }
 }
 
-/// The height of an expression.
 fn height(expr: &Expr) -> usize {
     let mut below = 0;
     expr.parts(&mut |part| below = below.max(height(part)));

@@ -2,7 +2,6 @@
 
 use super::parse::ParseError;
 
-/// A token.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Token {
     /// A name or a keyword.

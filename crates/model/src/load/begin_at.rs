@@ -88,7 +88,6 @@ fn why_not(state: &Node, comes_back: bool) -> Option<&'static str> {
     comes_back.then_some("a transition leads back to it or before it, and it begins at its own beginning then")
 }
 
-/// Whether a transition of a state leads to one of these names.
 fn leads_to_one_of(state: &Node, names: &[&str]) -> bool {
     let [entry] = state.entries() else { return false };
     let transitions = entry.value.get("transitions").map(Node::entries).unwrap_or_default();

@@ -14,7 +14,6 @@ use std::collections::BTreeMap;
 /// Keys that replace `do` with one effect.
 const VERBS: [&str; 4] = ["set", "delete", "increase", "decrease"];
 
-/// Effects by outcome.
 pub(crate) fn by_outcome(fields: &mut Fields<'_, '_>, node: &Node) -> BTreeMap<String, Vec<EffectExpr>> {
     let mut effects = BTreeMap::new();
     match &node.content {

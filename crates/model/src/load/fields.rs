@@ -52,7 +52,6 @@ pub(crate) struct Output {
     pub(crate) libraries: Vec<String>,
     /// The functions of the file: name, usage, number of arguments.
     pub(crate) functions: Vec<(String, String, usize)>,
-    /// The guards of states.
     pub(crate) guards: BTreeMap<StateId, Guard>,
 }
 

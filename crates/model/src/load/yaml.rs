@@ -14,11 +14,9 @@ pub const MAX_SOURCE: usize = 1 << 20;
 /// A YAML node.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Node {
-    /// Its location.
     pub(crate) at: Location,
     /// Byte offset of its beginning in the source.
     pub(crate) offset: Option<usize>,
-    /// Its content.
     pub(crate) content: Content,
 }
 

@@ -38,7 +38,6 @@ impl Agenda {
         self.entries.insert(place, entry);
     }
 
-    /// The time of the next entry.
     pub(super) fn next_at(&self) -> Option<Timestamp> {
         self.entries.first_key_value().map(|((at, _), _)| *at)
     }
@@ -57,7 +56,6 @@ impl Agenda {
         Some((place.0, entry))
     }
 
-    /// Takes the entries that answer an attempt.
     pub(super) fn take_answers(&mut self, instance: InstanceId, attempt: u32) -> Vec<(Place, Entry)> {
         let places = self.answers.remove(&(instance, attempt)).unwrap_or_default();
         places.into_iter().filter_map(|place| Some((place, self.entries.remove(&place)?))).collect()
@@ -69,7 +67,6 @@ impl Agenda {
     }
 }
 
-/// The attempt that an entry answers, if any.
 fn answered(entry: &Entry) -> Option<(InstanceId, u32)> {
     match entry {
         Entry::Event(

@@ -213,7 +213,6 @@ fn seldom(program: &Program, came: &BTreeSet<(StateId, &str)>, id: StateId) -> V
     handled.map(str::to_owned).collect()
 }
 
-/// The outcomes with which states have ended.
 fn outcomes(run: &Run) -> BTreeSet<(StateId, &str)> {
     let (mut states, mut came) = (BTreeMap::new(), BTreeSet::new());
     for line in &run.log {

@@ -25,7 +25,6 @@ const NUMBERS: usize = 3;
 /// Number of joints of an assumed arm.
 const JOINTS: usize = 7;
 
-/// The assumed providers.
 pub(super) struct AssumedProviders {
     /// By the path of the state.
     outputs: BTreeMap<String, BTreeMap<String, Type>>,
@@ -60,7 +59,6 @@ impl AssumedProviders {
         }
     }
 
-    /// The states with unknown duration.
     pub(super) fn unknown_durations(&mut self) -> BTreeSet<String> {
         std::mem::take(&mut self.unknown)
     }

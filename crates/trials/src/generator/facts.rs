@@ -36,7 +36,6 @@ pub(super) fn initial(features: &Features) -> Vec<EffectExpr> {
     all
 }
 
-/// The arity of a predicate.
 pub(super) fn arity(predicate: u64) -> usize {
     WIDER.iter().find(|(wider, _)| *wider == predicate).map_or(1, |(_, arity)| *arity)
 }

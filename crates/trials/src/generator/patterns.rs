@@ -52,7 +52,6 @@ fn one() -> Expr {
     Expr::Literal(Value::Int(1))
 }
 
-/// Every fact of a predicate.
 fn every(predicate: u64) -> FactExpr {
     FactExpr { predicate: format!("p{predicate}"), arguments: vec![None; facts::arity(predicate)] }
 }

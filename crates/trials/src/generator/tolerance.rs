@@ -17,7 +17,6 @@ use std::sync::LazyLock;
 pub(crate) const TOLERANT: u64 = 30;
 /// Largest difference between measured values and whole numbers.
 pub(crate) const OFF: f64 = 0.2;
-/// The tolerance.
 const TOLERANCE: f64 = 0.3;
 
 /// Declares the tolerance in the task, or in an ontology that also declares other facts.

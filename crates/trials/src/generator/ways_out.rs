@@ -102,7 +102,6 @@ fn contend(program: &Program, id: StateId) -> bool {
     })
 }
 
-/// The region around a state.
 fn region_of(program: &Program, id: StateId) -> Option<StateId> {
     let is_region = |state: &&State| {
         state.parent.is_some_and(|parent| matches!(program.state(parent).kind, StateKind::Concurrency { .. }))

@@ -187,7 +187,6 @@ fn say_states(program: &Program, part: &mut Expr) {
     }
 }
 
-/// The resource kinds for a catalogue.
 pub(super) fn resources() -> BTreeMap<String, ratn_model::catalogue::ResourceOffer> {
     let actuates = |kind: &str| ["Arm", "Head", "Base"].contains(&kind);
     let offer = |(kind, mut offer): (String, ratn_model::catalogue::ResourceOffer)| {

@@ -67,7 +67,6 @@ pub(super) fn with_measured(
     Ok(changes)
 }
 
-/// The facts after changes.
 pub(super) fn applied(before: &Facts, changes: &[Change], ontology: Option<&Ontology>) -> Result<Facts, Fail> {
     if let Some(ontology) = ontology {
         ontology.check_changes(changes).map_err(|violation| Fail::Wrong(violation.to_string()))?;

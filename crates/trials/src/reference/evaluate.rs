@@ -134,7 +134,6 @@ pub(super) fn term(value: &Value) -> Result<Term, Fail> {
 
 /// The reference's evaluation of an expression.
 pub(super) trait Read {
-    /// Its value.
     fn read(&self, place: &Place<'_>) -> Result<Value, Fail>;
     /// Whether it is true; null is false.
     fn is_true(&self, place: &Place<'_>) -> Result<bool, Fail>;

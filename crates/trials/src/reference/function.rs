@@ -8,7 +8,6 @@ use ratn_model::pose::Pose;
 use ratn_model::value::Value;
 use std::cmp::Ordering;
 
-/// The value of a call.
 pub(super) fn call(function: Function, arguments: &[Value]) -> Result<Value, Fail> {
     match (function, arguments) {
         (Function::GraspPose | Function::PlacePose, _) => Err(Fail::NotMine("what knows a gripper")),

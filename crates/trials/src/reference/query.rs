@@ -26,7 +26,6 @@ enum Says {
     Value(Expr),
 }
 
-/// Whether a query has an answer.
 pub(super) fn has_answer(query: &[Expr], place: &Place<'_>) -> Result<bool, Fail> {
     let mut hidden = place.row.len();
     let conditions = conditions(query, &mut hidden);

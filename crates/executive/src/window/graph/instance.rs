@@ -259,7 +259,6 @@ impl Instance {
         self.node().is_some_and(|node| !matches!(node.status, Status::Expanded | Status::Finished(_)))
     }
 
-    /// Whether it is a PIA.
     pub(crate) fn is_pia(&self) -> bool {
         self.node().is_some_and(|node| node.nature == NodeNature::Irreversible)
     }

@@ -25,7 +25,6 @@ struct Line {
     idle_visits: u32,
 }
 
-/// All lines.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Lines {
     all: BTreeMap<LineId, Line>,

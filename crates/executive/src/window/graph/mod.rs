@@ -44,7 +44,6 @@ struct Fork {
     join: Option<InstanceId>,
 }
 
-/// The graph.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Graph {
     instances: Instances,
@@ -128,7 +127,6 @@ impl Graph {
         self.branches.join(segment, id)
     }
 
-    /// Gives an instance one single arm.
     pub(crate) fn single_arm(&mut self, id: InstanceId, outcomes: Outcomes) {
         if let Some(instance) = self.instances.get_mut(id) {
             let segment = instance.segment;
@@ -287,7 +285,6 @@ impl Graph {
         &self.detached
     }
 
-    /// Sets the head of a line.
     pub(crate) fn set_head(&mut self, line: LineId, head: Option<InstanceId>) {
         let head = head.and_then(|id| Some((id, self.instances.get(id)?.position)));
         self.set_head_at(line, head);
@@ -373,7 +370,6 @@ impl Graph {
 
     // ── ending ──
 
-    /// Sets the end of an instance.
     pub(crate) fn end(&mut self, id: InstanceId, ended: Ended) {
         let Some(instance) = self.instances.get_mut(id) else { return };
         match &mut instance.body {

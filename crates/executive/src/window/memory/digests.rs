@@ -27,7 +27,6 @@ struct Sum {
     sum: u128,
 }
 
-/// The hash of one fact.
 pub(super) fn hash(key: &FactKey, value: &Value) -> u128 {
     let mut digester = Digester::<Quick>::default();
     digester.fact(key, value);

@@ -326,7 +326,6 @@ fn mentioned<'c>(condition: &'c Condition, visit: &mut dyn FnMut(&'c str)) {
     }
 }
 
-/// The variables that a fact binds.
 fn binds<'c>(fact: &'c FactExpr, condition: &'c Condition) -> impl Iterator<Item = &'c str> {
     let value = match condition {
         Condition::Fact(_, Says::Value(value)) => Some(value),

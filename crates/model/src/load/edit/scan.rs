@@ -15,7 +15,6 @@ impl<'t> Lines<'t> {
         Lines { text, starts }
     }
 
-    /// The byte offset of a location.
     pub(super) fn offset(&self, at: Location) -> Option<usize> {
         let line = (at.line as usize).checked_sub(1).filter(|line| *line < self.starts.len())?;
         let column = (at.column as usize).checked_sub(1)?;
@@ -191,7 +190,6 @@ pub(super) fn has_hidden_comment(text: &str) -> bool {
     begins_with(text, ['|', '>']) && begins.count() > comments(text).len()
 }
 
-/// Whether a value in the text begins with one of these characters.
 fn begins_with(text: &str, letters: [char; 2]) -> bool {
     let mut found = false;
     walk(text, |_, letter, token| {
