@@ -1,4 +1,4 @@
-//! What a state that waits is waiting for, and how its wait ends. Both modes call this; each decides itself when to check.
+//! What a waiting state waits for, and how its wait ends. Both modes call this, each at its own times.
 
 use crate::binding::{self, BindError, Outputs};
 use crate::protocol::Awaited;
@@ -81,8 +81,7 @@ pub(crate) fn has_come(state: &State, scope: &dyn Scope) -> Result<Option<WaitEn
     }
 }
 
-/// How a wait for a signal ends: takes the oldest kept signal of its name. `None`: no signal is kept, or it waits for
-/// something else.
+/// How a wait for a signal ends: takes the oldest kept signal of its name, if there is one.
 pub(crate) fn takes(state: &State, signals: &mut Signals) -> Option<WaitEnd> {
     match state.wait() {
         Some(Wait::Signal(name)) => Some(success([(VALUE.to_owned(), signals.take(name)?)].into())),
@@ -106,7 +105,7 @@ pub(crate) fn is_up(state: &State) -> WaitEnd {
     }
 }
 
-/// How a question ends when an operator answers with `choice`. `None`: the question does not offer this choice.
+/// How a question ends when answered with `choice`; `None` if it does not offer that.
 pub(crate) fn answered(state: &State, choice: &str) -> Option<WaitEnd> {
     match state.wait() {
         Some(Wait::Answer(question)) if question.choices.contains(&choice) => Some(chosen(state, choice)),
@@ -114,7 +113,7 @@ pub(crate) fn answered(state: &State, choice: &str) -> Option<WaitEnd> {
     }
 }
 
-/// The choice becomes the outcome if the state has an outcome of that name.
+/// The choice is the outcome if the state has one of that name.
 fn chosen(state: &State, choice: &str) -> WaitEnd {
     let is_outcome = state.outcomes.iter().any(|outcome| outcome == choice);
     let outcome = if is_outcome { choice } else { SUCCESS };
@@ -126,7 +125,7 @@ fn success(outputs: Outputs) -> WaitEnd {
     WaitEnd { outcome: SUCCESS.to_owned(), outputs, reason: String::new() }
 }
 
-/// An end without outputs: a `while` condition does not hold any more, or the time limit is over.
+/// An end without outputs: a `while` condition does not hold, or a timeout.
 pub(crate) fn cut_short(outcome: &str, reason: String) -> WaitEnd {
     WaitEnd { outcome: outcome.to_owned(), outputs: Outputs::new(), reason }
 }

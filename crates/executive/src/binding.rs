@@ -109,7 +109,7 @@ pub(crate) fn inputs(state: &State, inputs: &[(String, Expr)], scope: &dyn Scope
     Ok(bound)
 }
 
-/// The resources that a state requires, with their expressions evaluated.
+/// The requirements of a state, evaluated.
 pub(crate) fn requirements(
     state: &State,
     wanted: &[ResourceExpr],
@@ -146,7 +146,7 @@ pub(crate) fn not_holding<'e>(
     Ok(None)
 }
 
-/// The first declared output port that a provider did not return, or returned with a value of another type, as a reason.
+/// The first declared output port that is missing, or has a value of another type, as a reason.
 pub(crate) fn missing_output(
     declared: &BTreeMap<String, ratn_model::value::Type>,
     outputs: &Outputs,
@@ -160,8 +160,7 @@ pub(crate) fn missing_output(
     })
 }
 
-/// The declared estimate of a state's duration, in seconds; `None` if the state declares none, or if the value is not known
-/// yet.
+/// The declared estimate of a state's duration, in seconds; `None` if there is none, or its value is not known yet.
 pub(crate) fn expected_s(state: &State, scope: &dyn Scope) -> Option<f64> {
     let seconds = state.annotations.duration_s.as_ref()?.evaluate(scope).ok()?.as_number()?;
     (seconds.is_finite() && seconds >= 0.0).then_some(seconds)

@@ -54,8 +54,7 @@ impl Context<'_> {
         Ok(())
     }
 
-    /// Commits changes: at once in the mirror, and by a command in the world pool. `writer` is the path of the instance or state that
-    /// makes them.
+    /// Commits changes: at once in the mirror, by a command in the world pool. `writer` is the path of their writer.
     pub(crate) fn commit(&mut self, instance: InstanceId, writer: String, made: Made) -> Result<(), String> {
         if made.changes.is_empty() {
             return Ok(());
@@ -70,7 +69,7 @@ impl Context<'_> {
     }
 }
 
-/// The changes that a node has made, with the evidence (which measurement gave which fact).
+/// The changes made by a node, and their evidence.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Made {
     pub(crate) changes: Vec<Change>,

@@ -20,7 +20,7 @@ pub(crate) fn declared<'a>(state: &'a State, nature: NodeNature, outcome: &str) 
 /// Error: the changes of a finished node cannot be made.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub(crate) enum EffectError {
-    /// The expression of an effect has no value, although the node has finished.
+    /// An effect's expression has no value even though the node has finished.
     #[error("an effect cannot be evaluated: {0}")]
     Evaluate(#[from] EvaluateError),
     /// A provider measured a fact that no effect of this outcome declares.

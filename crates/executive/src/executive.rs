@@ -75,7 +75,7 @@ impl Executive {
         }
     }
 
-    /// Handles an event; returns the commands that the shell performs now, in order.
+    /// Handles an event; returns the shell's next commands, in order.
     pub fn handle(&mut self, now: Timestamp, event: Event) -> Vec<Command> {
         let mut commands = Vec::with_capacity(8);
         match event {
@@ -322,7 +322,7 @@ impl Executive {
     }
 }
 
-/// Cancels everything under way; the returned end contains the way out (`finally`) that is still to be executed.
+/// Cancels everything under way; the end returned contains the way out.
 fn cut_short(context: &mut Context<'_>, interpreter: &mut Interpreter, outcome: &str, reason: String) -> End {
     let mut way_out = WayOut::default();
     interpreter.way_out(context.program, &mut way_out);

@@ -5,10 +5,10 @@ use ratn_model::program::{Nature, Program, State, StateKind};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
-/// The operator's control over PIAs: which of them may begin.
+/// The operator's control over PIAs.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub(crate) struct Hold {
-    /// Number of PIAs that may still begin before it is a pause; `None`: no limit.
+    /// Number of PIAs that may still begin; `None`: no limit.
     steps: Option<u32>,
     /// The paths of the breakpoints, as the operator gave them.
     breakpoints: Vec<String>,
@@ -16,7 +16,7 @@ pub(crate) struct Hold {
     states: BTreeSet<StateId>,
     /// The PIA whose breakpoint caused the pause.
     stopped_at: Option<InstanceId>,
-    /// The PIA that may pass its breakpoint, because the operator resumed or stepped there.
+    /// The PIA that may pass its breakpoint.
     passes: Option<InstanceId>,
 }
 
@@ -78,8 +78,7 @@ impl Hold {
     }
 }
 
-/// The states at a path and inside of it. If the path is inside of a routine: that routine, because a routine is one
-/// PIA.
+/// The states at a path and inside of it. Inside of a routine: that routine, because it is one PIA.
 fn states_at(program: &Program, path: &str) -> impl Iterator<Item = StateId> {
     let is_in = |inner: &str, outer: &str| inner.strip_prefix(outer).is_some_and(|rest| rest.starts_with('/'));
     let meant = program.states.iter().filter(move |state| {

@@ -5,8 +5,8 @@ use ratn_model::expression::scope::NothingKnown;
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::program::Program;
 
-/// Whether somebody else's change of the fact `key` affects a commit: the commit overwrites this fact or was computed from it. `writer` is the path of
-/// the committing state, with visits. An argument that only the run knew stands for every fact of its predicate.
+/// Whether another writer's change of `key` affects a commit that overwrites this fact or was computed from it. `writer` is the path of the committing
+/// state, with visits. An argument that only the run knew stands for every fact of its predicate.
 #[must_use]
 pub fn was_overtaken(program: &Program, writer: &str, changes: &[Change], key: &FactKey) -> bool {
     let parts = writer.split('/').map(|part| part.split(['[', '#']).next().unwrap_or(part));

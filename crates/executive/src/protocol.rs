@@ -129,7 +129,7 @@ pub enum Event {
     Recorded {
         /// Number of the last recorded [`Command::Operate`]; they are numbered from 1.
         operation: u64,
-        /// Number of the session in which they are recorded. It is the run's session from now on, also if the run had another one before.
+        /// Number of the session with these records; it is the run's session from now on.
         session: u64,
     },
     /// When task control came back, the session under which the run held its resources was gone. Logged; changes nothing.
@@ -181,7 +181,7 @@ pub enum Event {
         /// The lease.
         lease: Lease,
     },
-    /// The resource manager refused a [`Command::Acquire`] for good.
+    /// The resource manager refused an acquire for good.
     Refused {
         /// The instance that asked.
         instance: InstanceId,
@@ -316,7 +316,7 @@ pub enum Command {
         instance: InstanceId,
         /// Its attempt.
         attempt: u32,
-        /// The revision of the root on which the projection is based.
+        /// The root's revision below the projection.
         base: Revision,
         /// The effects of the older instances that have not retired, in program order.
         changes: Vec<Change>,
@@ -358,14 +358,14 @@ pub enum Command {
     },
     /// Commit effects to the root world.
     Commit {
-        /// The instance whose effects they are.
+        /// The instance.
         instance: InstanceId,
         /// Path of the instance, or of the composite state at its exit; for the initial world the task's name.
         #[serde(default)]
         writer: String,
         /// The changes, in order. The root has revision `revision` afterwards.
         changes: Vec<Change>,
-        /// The evidence for the facts written: which measurement gave which of them.
+        /// Evidence for the facts written.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         evidence: Evidence,
         /// The root's revision after the commit.
@@ -373,7 +373,7 @@ pub enum Command {
     },
     /// Create and delete task resources, and consume what a composite state consumes at its exit.
     Operate {
-        /// The instance whose annotations they are.
+        /// The instance.
         instance: InstanceId,
         /// Creates, deletes and consumes, in order.
         operations: Vec<Requirement>,
@@ -502,7 +502,7 @@ pub enum Awaited {
         /// The signal's name.
         signal: String,
     },
-    /// An operator's answer: [`Event::Answered`].
+    /// An answer: [`Event::Answered`].
     Answer {
         /// The question.
         question: String,
@@ -566,8 +566,7 @@ pub struct Goal {
     /// Timeout in seconds of the robot's time: the goal is cancelled after it.
     #[serde(default)]
     pub timeout_s: Option<f64>,
-    /// For an anytime action, which may go on to improve its first result until it is cancelled: the outputs that must not change after the first
-    /// result.
+    /// For an anytime action, which may improve its first result until it is cancelled: the outputs that must not change then.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub improves: Option<Box<[String]>>,
     /// The state reads no facts, so the goal need not wait until earlier commits are confirmed. False in logs of earlier versions.

@@ -1,7 +1,7 @@
 //! Signals that were sent to the run and that no wait has taken yet.
 //!
-//! Each signal ends one wait, the oldest signal of a name first. A signal that arrives before its wait is kept for it. Only a wait at
-//! its place in the program takes a signal. Speculative instances take none, so no signal is lost with a branch that is not taken.
+//! Each signal ends one wait, the oldest signal of a name first; one that arrives before its wait is kept. Only a wait at its place in
+//! the program takes a signal, never a speculative instance, so none is lost with a branch that is not taken.
 
 use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
@@ -17,8 +17,8 @@ pub(crate) struct Signals {
 }
 
 impl Signals {
-    /// Keeps a signal for a later wait. Above the limit it is dropped; task control refuses such signals before they become events. If
-    /// a wait for this name is under way, none of its signals are kept, so a signal that is waited for is never refused.
+    /// Keeps a signal for a later wait. Above the limit it is dropped; task control refuses such signals before they become events.
+    /// While a wait for a name is under way, none of its signals are kept, so a signal that is waited for is never refused.
     pub(crate) fn came(&mut self, name: String, value: Value) {
         let of_name = self.kept.entry(name).or_default();
         if of_name.len() < MOST_SIGNALS_KEPT {

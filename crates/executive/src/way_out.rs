@@ -1,4 +1,4 @@
-//! The way out of a run that is cut short (aborted by the user, or over its deadline): the `finally` blocks that still have to run.
+//! The way out of a run that is aborted or over its deadline: its remaining `finally` blocks.
 //!
 //! The entered states that have a `finally` are left one after the other, the innermost first. First the states inside declare how being cut
 //! short changed the world (`effects: {preempted: […]}`), then the `finally` block is executed, by the sequential interpreter on the actual
@@ -40,7 +40,7 @@ pub(crate) struct WayOut {
 /// A state that is entered and not left: its path, and how often its `finally` was begun.
 pub(crate) type Place = (StateId, String, u32);
 
-/// The states that a routine's thread of control is in, the innermost first, with the variables and outputs in scope there.
+/// The states that a routine's thread is in, the innermost first, with the variables and outputs in scope.
 #[derive(Default)]
 pub(crate) struct Within {
     pub(crate) places: Vec<Place>,
@@ -109,11 +109,11 @@ impl WayOut {
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Leaving {
     end: End,
-    /// The remaining steps, the next one last.
+    /// Remaining steps, the next one last.
     steps: Vec<Step>,
     scopes: Vec<Scope>,
     hold: Hold,
-    /// The `finally` that is being executed, with the index of its scope.
+    /// The present `finally`, with the index of its scope.
     current: Option<(usize, Box<Interpreter>)>,
     until: Timestamp,
     /// Time of the last event.
@@ -123,7 +123,7 @@ pub(crate) struct Leaving {
 }
 
 impl Leaving {
-    /// Begins the way out; returns the end of the run if there is nothing to wait for.
+    /// Begins the way out; returns the run's end if there is nothing to wait for.
     pub(crate) fn begin(context: &mut Context<'_>, mut end: End) -> Result<Leaving, Box<End>> {
         let WayOut { scopes, mut steps, hold } = std::mem::take(&mut end.way_out);
         steps.sort_by_key(|step| (step.depth, std::cmp::Reverse(step.state)));

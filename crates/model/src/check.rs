@@ -54,14 +54,14 @@ pub(crate) struct Subject<'a> {
     pub(crate) control: &'a ControlFlow,
 }
 
-/// What the rules need to know about the file beside its program.
+/// What the rules need besides the program.
 pub(crate) struct Said<'a> {
     /// Whether the task declares its initial world.
     pub(crate) declares_world: bool,
     /// Whether the run begins at another state than the first; then unreachable states are no mistake.
     pub(crate) begins_elsewhere: bool,
     pub(crate) places: &'a Places,
-    /// The functions of the file, as in [`Subject`].
+    /// The functions of the file.
     pub(crate) functions: &'a [(String, String, usize)],
 }
 
@@ -113,7 +113,7 @@ pub(crate) fn named(program: &Program, expr: &Expr) -> String {
     named.to_string()
 }
 
-/// Replaces the output of a state, which has the state's id, by an expression that is displayed with the state's name.
+/// Replaces a state's id by its name in an output, for display.
 pub(crate) fn name_state(program: &Program, part: &mut Expr) {
     if let Expr::Port { state, port } = part {
         let name = Expr::Literal(Value::String(program.state(*state).name.clone()));

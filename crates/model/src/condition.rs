@@ -138,7 +138,7 @@ impl ConditionExpr {
     pub(crate) const WRITTEN: &str =
         "one attribute and what it must be like: `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`";
 
-    /// Parses `has camera`; `None` if the text is something else.
+    /// Parses `has camera`, if it is that.
     pub(crate) fn presence(text: &str) -> Option<ConditionExpr> {
         let is_name =
             |name: &&str| !name.is_empty() && name.chars().all(|c| c.is_alphanumeric() || c == '_' || c == '-');
@@ -146,7 +146,7 @@ impl ConditionExpr {
         Some(ConditionExpr { attribute, comparison: Comparison::Has, value: Expr::Literal(Value::Null) })
     }
 
-    /// Turns an expression like `payload >= 2.5` into a condition; `None` if it is something else.
+    /// An expression like `payload >= 2.5` as a condition.
     pub(crate) fn comparison(expression: Expr) -> Option<ConditionExpr> {
         let Expr::Binary(operator, left, right) = expression else { return None };
         let Expr::Literal(Value::String(attribute)) = *left else { return None };

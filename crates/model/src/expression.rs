@@ -58,7 +58,7 @@ pub enum Expr {
     Map(Vec<(String, Expr)>),
     /// A built-in pure function.
     Call(Function, Vec<Expr>),
-    /// `filter($x in list, …)`: a comprehension, which evaluates an expression for every element of a list.
+    /// `filter($x in list, …)`: a comprehension over every element of a list.
     Each {
         /// What the comprehension returns.
         what: Comprehension,
@@ -173,7 +173,7 @@ pub enum Function {
     Sort,
     /// `reverse(list)`
     Reverse,
-    /// `unique(list)` → the elements without duplicates, in the order of their first occurrence
+    /// `unique(list)` → the elements without duplicates, in order
     Unique,
     /// `starts_with(text, prefix)` → bool
     StartsWith,

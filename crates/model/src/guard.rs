@@ -41,12 +41,12 @@ use std::collections::BTreeMap;
 /// Limit of the number of states.
 const MAX_STATES: usize = 20_000;
 
-/// The guard around a state: what the file says under `retry`, `while`, `timeout`, `finally` and `each`.
+/// `retry`, `while`, `timeout`, `finally` and `each` of a state.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Guard {
     /// `retry`, if it is not left to the executive.
     pub retried: Option<Retried>,
-    /// `while` and `timeout`, if they are not left to the executive.
+    /// `while` and `timeout`, unless the executive handles them.
     pub limits: Option<Limits>,
     /// `finally`: states whose parent is the guarded state, but which are in none of its lists.
     pub finally: Vec<StateId>,
@@ -63,7 +63,7 @@ pub struct Collected {
     pub value: Expr,
 }
 
-/// `while` and `timeout` of a state. With them the state becomes one node of the program, because it becomes a preemptive concurrency.
+/// `while` and `timeout` of a state, which becomes a preemptive concurrency and so one node of the program.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Limits {
     /// Booleans that must hold in the actual world while the state runs; else it ends [`VIOLATED`].
@@ -86,7 +86,7 @@ pub struct Retried {
     pub backoff_s: f64,
     /// The outcomes after which the state is tried again.
     pub on: Vec<String>,
-    /// States that are executed before each further try; they belong to the state as those of [`Guard::finally`] do.
+    /// Executed before each further try; states as in [`Guard::finally`].
     pub before: Vec<StateId>,
 }
 
@@ -131,12 +131,12 @@ struct Unfolding<'a> {
     outcomes: Vec<Vec<String>>,
     /// New states: their lists have new ids, their transitions and expressions still have old ones.
     new: Vec<State>,
-    /// By new id, the index of its scope.
+    /// Scopes by new id.
     of_scope: Vec<usize>,
     scopes: Vec<Scope>,
     /// Transitions between new ids.
     links: Vec<(StateId, String, Target)>,
-    /// Pairs of a guard state and the state inside whose output ports it takes over.
+    /// Guard states that take over the output ports of an inner state.
     outputs: Vec<(StateId, StateId)>,
     /// `again` annotations, with new ids.
     again: Vec<(StateId, Again)>,
@@ -180,7 +180,7 @@ impl Unfolding<'_> {
             return self.written(id, parent, name, scope, is_outermost);
         };
         let around = self.around(id, parent, name, scope, is_outermost)?;
-        // The watch comes first: a condition that is false at the start must be found before anything begins.
+        // The watch is first: it must find a false condition before anything begins.
         let mut regions = Vec::new();
         if !limits.holds.is_empty() {
             let conditions = limits.holds.iter().map(|condition| ("for".to_owned(), condition.clone()));
@@ -194,7 +194,7 @@ impl Unfolding<'_> {
         regions.push(body);
         self.outputs.push((around, body));
         self.at(body).outcomes.retain(|outcome| outcome != VIOLATED);
-        // Effects of these outcomes move to the concurrency, because the body itself is cut short then.
+        // These outcomes end the concurrency; the body is cut short.
         let ends = [(PREEMPTED, true), (VIOLATED, !limits.holds.is_empty()), (ABORTED, limits.timeout_s.is_some())];
         for (outcome, _) in ends.into_iter().filter(|(_, ends)| *ends) {
             if let Some(effects) = self.at(body).annotations.effects.remove(outcome) {
@@ -275,8 +275,7 @@ impl Unfolding<'_> {
         Ok(new)
     }
 
-    /// Copies the body of a loop. If the loop collects values, the body is put into a state that appends this iteration's values at its end
-    /// ([`Program::is_pass`]).
+    /// Copies the body of a loop, put into a state that appends this iteration's values at its end if the loop collects any ([`Program::is_pass`]).
     fn passes(
         &mut self,
         id: StateId,
@@ -533,7 +532,7 @@ impl Unfolding<'_> {
         for (from, outcome, to) in &self.links {
             states[from.0 as usize].transitions.insert(outcome.clone(), to.clone());
         }
-        // In this order inner states come before the states around them.
+        // Inner states were made first.
         for (around, body) in &self.outputs {
             let port = |name: &String, ty: &Type| {
                 let value = Expr::Port { state: *body, port: name.clone() };

@@ -26,7 +26,7 @@ const MOST_TRUSTED: usize = 4096;
 /// The elements of a [`Value::List`]. Copies share them.
 #[derive(Clone)]
 pub struct List {
-    /// The elements of this list, followed by those of longer lists that share the buffer; after the first empty slot all are empty.
+    /// The elements of this list and of longer ones that share the buffer; no element follows an empty slot.
     slots: Arc<[OnceLock<Value>]>,
     len: usize,
 }

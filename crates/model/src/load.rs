@@ -244,7 +244,7 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     hasher.update(source.as_bytes());
     hasher.update(ontology_text.unwrap_or_default().as_bytes());
     hasher.update(loading.from.unwrap_or_default().as_bytes());
-    // The annotations of used actions belong to the task's digest, as the texts of its libraries do.
+    // The digest includes the annotations of used actions, like the texts of libraries.
     for (action, said) in said_by_actions(&states, catalogue) {
         hasher.update(action.as_bytes());
         hasher.update(said.as_bytes());
@@ -496,7 +496,7 @@ fn ports(
     outline.steps.iter().enumerate().map(of_step).collect()
 }
 
-/// Whether this is `{type: int, default: 0}`, with either or both keys, and not a record type with these two fields.
+/// Whether this is `{type: int, default: 0}`, with either or both, and not such a record type.
 fn is_port_form(node: &Node) -> bool {
     let entries = node.entries();
     !entries.is_empty()

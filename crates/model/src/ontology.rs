@@ -22,7 +22,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
-/// The classes, individuals and predicates of facts.
+/// What facts may exist.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Ontology {
     /// Every class with all its superclasses, including itself.
@@ -146,7 +146,7 @@ impl Ontology {
         self.classes_of(individual).any(|of| self.classes.get(of).is_some_and(|above| above.contains(class)))
     }
 
-    /// Checks whether facts that match this pattern are allowed.
+    /// Checks a pattern of facts.
     ///
     /// # Errors
     /// The violated rule.

@@ -51,7 +51,7 @@ pub struct Program {
     pub outputs: Vec<TaskOutput>,
     /// The facts that hold at the start, over what the world pool already holds; arguments may use parameters.
     pub initial: Vec<EffectExpr>,
-    /// Tolerances within which a measured value counts as the predicted one, as far as the task and its ontology give them.
+    /// Tolerances for measured values, as far as the task and its ontology give them.
     pub tolerances: Tolerances,
     /// The ontology of its facts; `None` allows all facts.
     pub ontology: Option<Ontology>,
@@ -164,7 +164,7 @@ pub enum StateKind {
     While {
         /// A boolean, evaluated before each iteration.
         predicate: Expr,
-        /// Whether the first iteration begins without testing the predicate, as in `do … while`.
+        /// Whether the first iteration is not tested: `do … while`.
         body_first: bool,
         /// The variable bound to the number of the iteration (from 0), if wanted.
         index: Option<String>,
@@ -220,7 +220,7 @@ pub struct Annotations {
     pub effects: BTreeMap<String, Vec<EffectExpr>>,
     /// What it asks of the resource manager.
     pub resources: Vec<ResourceExpr>,
-    /// Whether it is a routine: the sequential interpreter executes it, with everything inside of it, as one node.
+    /// Routine: the sequential interpreter executes it with its parts as one node.
     pub routine: bool,
     /// Estimated duration in seconds of the robot's time.
     pub duration_s: Option<Expr>,
@@ -236,7 +236,7 @@ pub struct Annotations {
     pub exceptional: Vec<String>,
     /// Whether equal inputs and facts always give the same result, whatever the seed.
     pub deterministic: bool,
-    /// Whether its action is anytime: it gives a usable result first and better ones later; any of them is acceptable.
+    /// Anytime: its action gives a usable result first, and better ones later; any will do.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub anytime: bool,
     /// For a region: facts that other regions may also change. The programmer is responsible for their order.
@@ -258,7 +258,7 @@ pub enum Origin {
     State,
     /// Its action, in the catalogue.
     Action,
-    /// Both: effects of state and action are combined.
+    /// Both: effects are combined.
     Both,
     /// Implied: a state that reads facts ahead of its place needs a projection.
     Reads,

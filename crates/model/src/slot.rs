@@ -1,5 +1,5 @@
-//! The places of expressions in a state, with one walk over all of them. Code that needs the expressions of a state (to find
-//! what it reads, needs or uses) calls this walk and selects by [`Slot`]; no other code takes a state apart for its expressions.
+//! The places of expressions in a state, with one walk over all of them. Code that needs a state's expressions calls this walk
+//! and selects by [`Slot`]; no other code takes a state apart.
 //!
 //! The walk visits whole expressions, in the order of [`Slot`]'s variants; their parts are visited by [`Expr::visit`].
 

@@ -381,8 +381,8 @@ impl fmt::Display for Value {
     }
 }
 
-/// A number with this many decimals, or with all that it has. Numbers with more than sixteen digits before the decimal point, or many zeros
-/// after it, are written with an exponent.
+/// A number with this many decimals, or with all that it has. Above sixteen digits before the point, or with many zeros behind it, it has
+/// an exponent.
 fn float(f: &mut fmt::Formatter<'_>, number: f64, digits: Option<usize>) -> fmt::Result {
     match digits {
         _ if number.is_finite() && number.abs() >= 1e16 => write!(f, "{number:e}"),

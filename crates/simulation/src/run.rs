@@ -40,7 +40,7 @@ const LINES_PER_EVENT: usize = 20;
 /// … and limit of log lines in total, at most a gigabyte.
 const MAX_LINES: usize = 3_000_000;
 
-/// The environment: decides what the providers do.
+/// The environment.
 pub trait Oracle {
     /// The course of a goal. `world` is its projection, or the actual world if it has none.
     fn perform(&mut self, path: &str, attempt: u32, goal: &Goal, world: &World) -> Performance;
@@ -108,7 +108,7 @@ pub struct Setup {
     pub resources: Vec<(String, ResourceOffer)>,
     /// The facts that hold before the task's own initial world.
     pub world: Vec<(FactKey, Value)>,
-    /// Tolerance within which a measured value counts as the predicted one.
+    /// Tolerance for measured values.
     pub tolerance: Tolerance,
     /// Leases and projections take up to this long, at random by the seed, so that messages can cross.
     pub latency: Duration,

@@ -1,8 +1,7 @@
 //! Several concurrent runs in virtual time: one resource pool, one root world, an executive per run.
 //!
-//! A commit of one run is sent to the others at once, as a change from outside. Leases and projections arrive late, at random. Whether the real
-//! system sends such changes in time is not simulated: there, a new holder of a lease has been told what the last holder committed
-//! (`ratn-task-control`).
+//! A commit of one run is sent to the others at once, as a change from outside. Leases and projections arrive late, at random. Not simulated:
+//! in the real system a holder of a lease is told in time what the last holder committed (`ratn-task-control`).
 //!
 //! The task control of a run may die without notice and be resumed from its event log (`death`).
 
@@ -98,7 +97,7 @@ pub enum What {
     Died,
     /// Its task control was resumed from its event log.
     TakenUp {
-        /// Whether the resources that it held were gone.
+        /// Whether its resources were gone.
         has_lost: bool,
     },
 }
@@ -317,7 +316,7 @@ impl System<'_> {
         self.runs[run].executive.check_invariants().map_err(|problem| self.broken(problem))
     }
 
-    /// Lets the executive of a run handle an event; the event and the commands are logged.
+    /// A run handles an event; both event and commands are logged.
     fn decide(&mut self, run: usize, event: Event) -> Vec<Command> {
         let (at, one) = (self.now, &mut self.runs[run]);
         let commands = one.executive.handle(at, event.clone());

@@ -60,7 +60,7 @@ pub(super) fn early_signals(program: &Program, seed: u64) -> Vec<(String, Value)
     early
 }
 
-/// The facts that make a condition made by the generator hold (or, with `holds` false, not hold).
+/// The facts that make a condition of the generator true (or false, by `holds`).
 fn make(condition: &Expr, holds: bool, facts: &mut Vec<(FactKey, Option<Value>)>) {
     match condition {
         Expr::Binary(BinaryOperator::And, a, b) => {

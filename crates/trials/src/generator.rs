@@ -150,8 +150,8 @@ pub fn program(seed: u64, features: &Features) -> Program {
     program
 }
 
-/// Removes consumption from routines: a routine acquires at its entry what any state inside consumes, even if that state is never reached, so it would differ
-/// from its states executed one by one.
+/// Removes consumption from routines: a routine acquires at its entry what any inner state consumes, even if that state is never reached, so it would differ
+/// from its states one by one.
 fn create_in_routines(program: &mut Program) {
     let inside: Vec<StateId> =
         program.states.iter().filter(|state| is_in_routine(program, state)).map(|state| state.id).collect();

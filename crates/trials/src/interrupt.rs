@@ -53,8 +53,8 @@ pub fn trial_interrupted(program: &Arc<Program>, conditions: &Conditions) -> Ver
     }
 }
 
-/// Checks that both modes do a first part of the undisturbed HSM run and end by this outcome; with `alike`, that they
-/// also end alike.
+/// Checks that both modes do a first part of the undisturbed HSM run and end by this outcome; with `alike`, in the same
+/// way.
 fn parts(
     program: &Arc<Program>,
     conditions: &Conditions,

@@ -23,7 +23,7 @@ pub(super) fn say_with_comprehensions(program: &mut Program, dice: &mut Dice) {
                 expr.visit(&mut |part| found |= matches!(part, Expr::Query(_)));
                 found
             };
-            // Conditions of a query are left as they are, because planning depends on their form.
+            // Planning depends on the form of a query's conditions.
             if parts <= MOST_PARTS && !in_query(expression) {
                 expression.rewrite(&mut |part| {
                     if dice.below(EVERY) == 0 {

@@ -159,7 +159,7 @@ impl HashOracle<'_> {
         if back { FOUND.to_owned() } else { chosen.to_owned() }
     }
 
-    /// Facts whose measured values differ from the effects of this outcome; `x` is the value of the node's output `x`.
+    /// Facts whose measured values differ from the outcome's effects; `x` is the node's output.
     fn measured(
         &self,
         dice: &mut Dice,

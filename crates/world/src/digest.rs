@@ -91,7 +91,7 @@ impl Digest {
     }
 
     /// The digest of what a world shows through a footprint: of the requested facts and of those that exist. So "nothing matched"
-    /// has a digest, too, and two different footprints never have the same digest, even if they show the same facts.
+    /// has a digest, too, and different footprints have different digests even if they show the same.
     pub fn of_reads(world: &World, reads: &Footprint) -> Digest {
         let mut digester = Digester::default();
         match reads {

@@ -23,9 +23,9 @@
 //! | 1,000 projections of 20 effects, beside the facts | | 5.2 MB | |
 //! | scene of 1,000 objects: 20 move, and the delta is made | 56 µs | | |
 //!
-//! Checking a commit against live projections costs about 50 ns per projection that has read a written fact. The table of facts that worlds share
-//! is divided into shards of at most 16,384 facts; a shard is copied when an eighth of it has changed beside it. So one write copies at most one
-//! shard, but shards that are written equally often reach that point together: a commit of 20 facts anywhere among 10⁶ may copy 20 shards.
+//! Checking a commit against live projections costs about 50 ns per projection that has read a written fact. The shared table of facts is divided
+//! into shards of at most 16,384 facts; a shard is copied when an eighth of it has changed beside it. So one write copies at most one shard, but
+//! shards that are written equally often reach that point together: a commit of 20 facts anywhere among 10⁶ may copy 20.
 
 pub mod digest;
 mod functional;

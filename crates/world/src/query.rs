@@ -47,7 +47,7 @@ pub struct Rows {
     pub more: bool,
 }
 
-/// Error: a query could not be answered; different from having no answers.
+/// Error: the query could not be answered.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum QueryError {
     /// The text is no query.
@@ -63,7 +63,7 @@ pub enum QueryError {
     /// The query cannot be planned.
     #[error(transparent)]
     Plan(#[from] PlanError),
-    /// It asks about facts that the ontology does not allow.
+    /// The ontology does not allow its facts.
     #[error(transparent)]
     Ontology(#[from] Violation),
     /// An argument is missing.

@@ -73,7 +73,7 @@ struct Written {
     hash: u64,
     /// The index of an effect that writes one.
     effect: usize,
-    /// Whether it is the only such effect, and no effect deletes anything.
+    /// No other effect does, and none deletes anything.
     alone: bool,
 }
 
@@ -163,7 +163,7 @@ impl<Id: Ord + Copy> Live<Id> {
         self.places.insert(id, place);
     }
 
-    /// Removes a projection on which nothing depends any more.
+    /// Removes a projection.
     pub fn remove(&mut self, id: Id) {
         let Some(place) = self.places.remove(&id) else { return };
         let Some((_, projection)) = self.projections[place].take() else { return };
@@ -375,7 +375,7 @@ struct Fact<'a> {
     now: Option<&'a Value>,
 }
 
-/// The earlier and the present value.
+/// Earlier and present value.
 type Difference = (Option<Value>, Option<Value>);
 
 impl<'a> Fact<'a> {
@@ -408,7 +408,7 @@ fn add<Id: Ord + Copy>(found: &mut BTreeMap<Id, Contradiction<Id>>, id: Id, fact
     }
 }
 
-/// The difference between the two values, if they differ beyond the tolerance.
+/// The difference of the values, beyond the tolerance.
 fn differ(
     fact: &Fact<'_>,
     was: Option<&Value>,

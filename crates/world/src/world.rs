@@ -165,7 +165,7 @@ impl World {
     }
 
     /// Visits the facts that match, together with others that the index cannot separate, in the order of keys, until `visit`
-    /// returns false. So the caller can count what is visited, which is the cost.
+    /// returns false; what is visited is the cost.
     pub fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) {
         if self.overlay.is_empty() {
             self.store.candidates(pattern).all(|(key, fact)| visit(key, &fact.value));

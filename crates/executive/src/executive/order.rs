@@ -27,7 +27,7 @@ use std::collections::BTreeMap;
 /// The place of a command: its part, its position in the program, its turn among commands with the same position, and its priority.
 type Place = (u8, usize, Turn, Reverse<i64>);
 
-/// Order of commands that are moved to the place of another command: cancellations first, then releases, then the command itself.
+/// Order of commands moved to another command's place: cancellations, then releases, then that command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Turn {
     Stop,

@@ -121,7 +121,7 @@ impl Interpreter {
         current.phase = Phase::Stalled;
         match self.threads.get(&thread).and_then(|thread| thread.routine) {
             Some(_) if !self.may_try(context, thread) => {}
-            // A node that waits in a race loses it. The other regions keep the lease, so the node goes on with what is left of it.
+            // A node that waits loses its race, so it goes on with what is left of the lease.
             Some(routine) if self.uses_lease(context.program, routine) && is_in_race(context.program, id) => {
                 self.project_or_run(context, thread);
             }

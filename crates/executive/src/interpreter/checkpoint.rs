@@ -15,8 +15,7 @@ use std::sync::Arc;
 /// The shared values, and per thread the names of its variables with the places of their values.
 type Form<V, T, N> = (Vec<V>, Vec<(u64, T, Vec<(N, u32)>)>);
 
-/// Keeps track of which threads share a value: a join recognizes an assignment of a region by a value that is no longer
-/// shared.
+/// Keeps which threads share a value: a join recognizes an assignment by a value that is not shared.
 pub(super) fn serialize<S: Serializer>(threads: &BTreeMap<u64, Thread>, to: S) -> Result<S::Ok, S::Error> {
     let mut values: Pool<&Value> = Pool::default();
     let mut forms = Vec::new();

@@ -47,7 +47,7 @@ impl Interpreter {
         self.ended(thread, id, outcome, reason);
     }
 
-    /// Outputs, assignments, effects and resource operations at the exit; returns the new values of variables.
+    /// Everything that the exit does; returns the new values of variables.
     fn boundary(
         &mut self,
         context: &mut Context<'_>,
@@ -121,7 +121,7 @@ impl Interpreter {
         state.assign.iter().map(value).collect()
     }
 
-    /// Assigns new values; of several variables with the same name, the innermost is meant.
+    /// Assigns new values, each to the innermost variable of its name.
     pub(super) fn assign(&mut self, thread: u64, assigned: Vec<(String, Value)>) {
         let Some(thread) = self.threads.get_mut(&thread) else { return };
         for (name, value) in assigned {

@@ -54,7 +54,7 @@ pub(crate) enum Target {
     Actual,
     /// Into a projection: nothing becomes real.
     Projection {
-        /// The root's revision on which the projection is based.
+        /// The root's revision below the projection.
         base: Revision,
         /// Changes since then, in order: first the effects of older instances, then those of this routine.
         changes: Vec<Change>,
@@ -89,7 +89,7 @@ pub(crate) enum Progress {
 struct Frame {
     /// The state whose list it is.
     owner: StateId,
-    /// The number of the list among the owner's lists.
+    /// Its number among the owner's lists.
     list: usize,
     /// The owner's path, without the iteration.
     path: String,
@@ -120,7 +120,7 @@ enum Todo {
     Done { outcome: String, reason: String },
 }
 
-/// The decision of a concurrency, made before the regions that it cuts short have ended.
+/// The decision of a concurrency whose other regions are still being cut short.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 struct Decided {
     /// The first region, in program order, that has ended.
@@ -140,7 +140,7 @@ struct CutShort {
     problem: String,
 }
 
-/// A thread of control: the main thread of the executed state, or that of a region.
+/// A thread of control: the main one, or that of a region.
 #[derive(Serialize, Deserialize)]
 struct Thread {
     frames: Vec<Frame>,
@@ -419,7 +419,7 @@ impl Interpreter {
         self.threads.get(&thread)?.current.as_ref().map(|current| current.phase)
     }
 
-    /// Calls `use_scope` with the scope of a thread at its present place.
+    /// Calls `use_scope` with the present scope of a thread.
     fn with_scope<T>(
         &self,
         context: &Context<'_>,

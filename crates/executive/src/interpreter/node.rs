@@ -104,8 +104,8 @@ impl Interpreter {
         }
     }
 
-    /// Holds a node whose pause began while it waited for its resources. It gives them back, because others may want them meanwhile, and asks
-    /// again when it may begin. It keeps a lease with consumed resources. It gives back its projection, because the world may change meanwhile.
+    /// Holds a node that was waiting for its resources. It gives them back, because others may want them, and asks again when it may begin; a
+    /// lease with consumed resources is kept. A new projection is made then, because the world may change.
     pub(super) fn hold_back(&mut self, context: &mut Context<'_>, thread: u64) {
         let Some(current) = self.current(thread) else { return };
         current.phase = Phase::Held;
@@ -254,7 +254,7 @@ impl Interpreter {
         self.end_unanswered(context, thread, ABORTED, reason);
     }
 
-    /// Ends a node with an outcome but without a result; not even the declared effects of the outcome are applied.
+    /// Ends a node without a result; not even the declared effects of the outcome are applied.
     pub(super) fn end_unanswered(&mut self, context: &mut Context<'_>, thread: u64, outcome: &str, reason: String) {
         let Some(current) = self.threads.get_mut(&thread).and_then(|thread| thread.current.take()) else { return };
         context.note(Note::Finished { instance: current.instance, outcome: outcome.into() });

@@ -155,7 +155,7 @@ impl Interpreter {
         self.exit(context, thread, id, &path, base, outcome, reason);
     }
 
-    /// The decision of a concurrency, as its regions are now.
+    /// The present decision of a concurrency.
     fn decision(&self, program: &Program, id: StateId, regions: &[u64]) -> Decided {
         let StateKind::Concurrency { successes, .. } = &program.state(id).kind else {
             return Decided { first: None, enough: None, is_entered: true };

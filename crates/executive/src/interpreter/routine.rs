@@ -1,6 +1,5 @@
-//! Routines in HSM mode. At its entry a routine acquires all resources that its parts need and holds them to its end, so that no
-//! other node gets them in between. It is one PIA if any part is a PIA. Routines and preemptive concurrencies inside of it belong
-//! to it.
+//! Routines in HSM mode. A routine acquires at its entry everything that its parts need and holds it to its end, so that no other
+//! node gets it in between. It is one PIA if any part is one. Inner routines and preemptive concurrencies belong to it.
 //!
 //! A routine of the window gets its lease from the window; everything in its interpreter belongs to that routine.
 

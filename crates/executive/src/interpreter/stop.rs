@@ -19,7 +19,7 @@ impl Interpreter {
     pub(crate) fn abort(&mut self, context: &mut Context<'_>) {
         let all: Vec<u64> = self.threads.keys().copied().collect();
         for thread in all {
-            // An error does not matter: the run ends anyway.
+            // Errors do not matter: the run ends anyway.
             let _ = self.cancel(context, thread);
             self.set(thread, Todo::Done { outcome: PREEMPTED.to_owned(), reason: String::new() });
         }
@@ -72,7 +72,7 @@ impl Interpreter {
         }
     }
 
-    /// The regions of a concurrency that is cut short have ended: leaves the concurrency.
+    /// Leaves a concurrency whose regions have been cut short.
     pub(super) fn leave_regions(
         &mut self,
         context: &mut Context<'_>,
@@ -175,8 +175,8 @@ impl Interpreter {
         way.hold = self.hold.clone();
     }
 
-    /// The same for the threads of regions; the place of the main thread is returned, because for a routine of the window the states around it
-    /// belong to the same thread of control. `None` on a projection, where nothing is real.
+    /// The same for the regions' threads; returns the place of the main thread, because the states around a routine of the window belong to the
+    /// same thread of control. `None` on a projection, where nothing is real.
     pub(crate) fn way_out_within(&self, program: &Program, way: &mut WayOut) -> Option<Within> {
         if !matches!(self.target, Target::Actual) {
             return None;

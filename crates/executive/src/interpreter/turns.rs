@@ -117,7 +117,7 @@ fn units_of(line: &ResourceExpr) -> usize {
     line.count.units() as usize
 }
 
-/// How many of the units that a resource line wants are in the routine's lease.
+/// How many of the wanted units the routine has.
 struct Granted<'a> {
     count: usize,
     /// Their ids, if no other unit of the lease can be meant.

@@ -182,7 +182,7 @@ impl Interpreter {
         }
     }
 
-    /// The path of the state that is visited now; counts the visit.
+    /// Counts a visit of a state; returns its path.
     fn visit(&mut self, thread: u64, id: StateId, name: &str) -> String {
         let Some(frame) = self.threads.get_mut(&thread).and_then(|thread| thread.frames.last_mut()) else {
             return name.to_owned();

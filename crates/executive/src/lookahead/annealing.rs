@@ -14,7 +14,7 @@ use super::network::Place;
 const CYCLE: u32 = 4_000;
 /// At the beginning of a cycle, an end that is later by this share of the total time is accepted with probability 1/e …
 const HOT: f64 = 0.01;
-/// … and at the end of a cycle, one that is later by this share.
+/// … and at its end, one that is later by this share.
 const COLD: f64 = 0.0005;
 
 /// The order and the state of the annealing.
@@ -49,7 +49,7 @@ impl Annealing {
         }
     }
 
-    /// Accepts or rejects the simulated order: the sequence in which its tasks began, and the time when all had ended.
+    /// Accepts or rejects an order, given the simulated sequence and its end.
     pub(super) fn judge(&mut self, sequence: &[Place], end: u64, best_end: u64) {
         let temperature = HOT * (COLD / HOT).powf(f64::from(self.steps) / f64::from(CYCLE)) * best_end as f64;
         self.steps += 1;

@@ -57,13 +57,13 @@ pub(super) struct Network {
     pub(super) demands: Lists<Demand>,
     pub(super) before: Lists<Place>,
     pub(super) behind: Lists<Place>,
-    /// A topological order: each task after its predecessors, else in program order.
+    /// A topological order, else program order.
     pub(super) order: Vec<Place>,
     /// The holds that are in force now.
     pub(super) holds: Holds,
     /// By kind, in thousandths of a unit.
     pub(super) capacity: Vec<u64>,
-    /// Longest remaining path in nanoseconds, with the task's own duration; plain dispatch serves by it.
+    /// Longest remaining path in nanoseconds, including the task; priority of plain dispatch.
     pub(super) remaining: Vec<u64>,
 }
 

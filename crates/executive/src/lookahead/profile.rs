@@ -54,8 +54,8 @@ impl Profile {
         start
     }
 
-    /// The earliest moment, the step in which it lies and the step in which the duration ends; `None` if it never fits. Demands
-    /// never exceed the capacity, because they were bounded by it.
+    /// The earliest moment, its step and the step in which the duration ends; `None` if it never fits, which bounded demands
+    /// exclude.
     fn earliest(&self, wanted: &[u64], from: u64, duration: u64) -> Option<(u64, usize, usize)> {
         let mut first = self.times.partition_point(|time| *time <= from) - 1;
         let (mut start, mut end, mut step) = (from, from.saturating_add(duration), first);

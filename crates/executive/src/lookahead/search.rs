@@ -54,11 +54,11 @@ enum Method {
 pub struct Advice {
     /// When everything has ended with this advice, in seconds from now.
     pub end_s: f64,
-    /// When everything has ended with the present urgencies, in seconds from now.
+    /// When everything has ended without it, in seconds from now.
     pub plain_s: f64,
     /// For [`crate::protocol::Event::Advised`]: the urgency of every task that has not begun.
     pub urgency_s: Vec<(InstanceId, f64)>,
-    /// For the same event: the instances that are held back.
+    /// For the same: the instances held back.
     pub held: Vec<Held>,
 }
 

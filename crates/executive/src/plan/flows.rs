@@ -25,7 +25,7 @@ pub(super) fn start_flows(subject: &Subject<'_>) -> Vec<StateId> {
             }
         });
     }
-    // An expression of a loop's state that reads the state's own output means the visit before.
+    // A loop's state that reads its own output means the visit before.
     if subject.contains_others() { without_inside(flows, subject) } else { flows.into_iter().collect() }
 }
 

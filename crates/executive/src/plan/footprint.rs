@@ -37,8 +37,8 @@ pub(super) fn reads(subject: &Subject<'_>, requirements: &[ResourceExpr]) -> Opt
     let selectors = requirements.iter().flat_map(|r| r.expressions());
     all.extend(selectors.flat_map(|expression| expression.fact_expressions()).cloned());
     if subject.is_routine() {
-        // On a projection the parts change facts one after the other, so these facts must be visible with their earlier values. An ontology also
-        // looks at other facts of the predicate.
+        // On a projection the parts change facts in turn, so the earlier values must be visible. An ontology also looks at other facts of the
+        // predicate.
         let whole = subject.program.ontology.is_some();
         for effect in subject.contained.iter().flat_map(|state| state.annotations.effects.values()).flatten() {
             let any = |fact: &FactExpr| FactExpr { arguments: vec![None; fact.arguments.len()], ..fact.clone() };
@@ -124,9 +124,8 @@ pub(super) fn senses(subject: &Subject<'_>) -> Vec<FactExpr> {
     subject.contained.iter().flat_map(|state| state.annotations.senses()).cloned().collect()
 }
 
-/// The facts for which a node tolerates no deviation. An action, also inside of a routine, ignores tolerated deviations of what it reads. What a
-/// node assigns must follow from the exact facts; for a routine that holds for everything it computes itself. Preconditions of the node are
-/// checked when it retires.
+/// The facts for which a node tolerates no deviation. An action, also inside of a routine, ignores tolerated deviations of what it reads; its
+/// assignments are exact, and so is everything that a routine computes itself. The node's preconditions are checked when it retires.
 pub(super) fn exact(subject: &Subject<'_>) -> Vec<FactExpr> {
     let is_exact = |state: &State, slot: Slot<'_>| match slot {
         Slot::Assign(_) => true,

@@ -64,7 +64,7 @@ pub(crate) struct StatePlan {
     pub(crate) is_routine: bool,
     /// A region of a concurrency.
     pub(crate) is_region: bool,
-    /// Its exceptions are imprecise: younger PIAs may run beside it.
+    /// Imprecise exceptions: younger PIAs may run beside it.
     pub(crate) imprecise: bool,
     /// It waits, or something that it contains does.
     pub(crate) waits: bool,
@@ -83,7 +83,7 @@ pub(crate) struct StatePlan {
     pub(crate) effects: Vec<Effects>,
     /// The predicates that the effects of each outcome write.
     pub(crate) effect_predicates: Vec<Vec<Predicate>>,
-    /// The keys that the effects of each outcome write; nothing if they may write every fact.
+    /// The keys written by each outcome's effects; nothing if they may write every fact.
     pub(crate) effects_written: Vec<Vec<Written>>,
     /// The outcomes with which the exit of this composite state has work to do: effects, outputs, assignments, resources.
     pub(crate) exits: Outcomes,

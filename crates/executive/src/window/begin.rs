@@ -22,7 +22,7 @@ use ratn_model::resource::{Requirement, ResourceOperation};
 use std::sync::Arc;
 
 impl Window {
-    /// Begins a node that has not begun, or notes what it waits for.
+    /// Begins a node, or notes what it waits for.
     pub(super) fn begin(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.follow_root(context);
         let looked = self.look(context, id, None, |instance, view| {
@@ -90,7 +90,7 @@ impl Window {
         self.end_node(context, id, Ended { outputs, ..Ended::aborted(reason) });
     }
 
-    /// The outputs of a node that did not run: a routine leaves the variables that it would assign as they were.
+    /// The outputs of a node that did not run: a routine keeps the variables that it would assign.
     pub(super) fn unassigned(&self, context: &Context<'_>, id: InstanceId) -> Outputs {
         let outputs = self.look(context, id, None, |instance, view| {
             let own = context.plan.state(instance.state);

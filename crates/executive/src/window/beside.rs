@@ -15,13 +15,13 @@ pub(super) type Region = (InstanceId, StateId);
 
 /// Shared facts that a region has changed, for the regions beside it.
 pub(super) struct Crossing {
-    /// The region that changed them, preceded by the regions around it, the outermost first.
+    /// The region that changed them, with those around it, the outermost first.
     by: Vec<Region>,
     facts: Vec<FactPattern>,
 }
 
 impl Window {
-    /// Notes the shared facts among changes that an instance has committed.
+    /// Notes shared facts among committed changes.
     pub(super) fn note_crossing<'c>(
         &mut self,
         context: &Context<'_>,
@@ -39,7 +39,7 @@ impl Window {
         }
     }
 
-    /// Notes the shared facts that a routine has committed, by the commands from index `since` on.
+    /// Notes shared facts that a routine has committed, from command `since` on.
     pub(super) fn note_crossings_of_routine(&mut self, context: &Context<'_>, id: InstanceId, since: usize) {
         let changes = context.commands[since..].iter().filter_map(|command| match command {
             Command::Commit { changes, .. } => Some(changes),
@@ -80,7 +80,7 @@ impl Window {
         self.decide_again(context, elsewhere, &Footprint::Patterns(facts));
     }
 
-    /// Whether the instance is under way at its place: everything before it in its region has ended, as in the sequential program.
+    /// Whether the sequential program would also be at it: everything before it in its region has ended.
     fn is_at_its_place(&self, instance: &Instance) -> bool {
         instance.is_head && instance.is_under_way() && self.older_beside(instance).is_none()
     }

@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct Beside<'a> {
     places: Places<'a>,
-    /// For every routine under way on a projection, oldest first: the projection's base and changes.
+    /// By routine under way on a projection, oldest first: base and changes.
     projections: Vec<(Revision, Vec<Change>)>,
 }
 

@@ -19,7 +19,7 @@ use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, StateKind, VIOLATED};
 use ratn_model::value::Value;
 
 impl Window {
-    /// What a decision by these expressions has to wait for; `None`: it can be made.
+    /// What a decision by these expressions waits for, if anything.
     pub(super) fn undecidable(&mut self, context: &Context<'_>, id: InstanceId, from: &[&Expr]) -> Option<Wait> {
         undecidable(&mut self.graph, &self.memory, context, id, from)
     }
@@ -197,8 +197,7 @@ impl Window {
             let value = self.look(context, instance.id, Some(&outputs), |instance, view| {
                 let mut looked = Seen::default();
                 let value = expression.evaluate(view).map_err(|error| {
-                    // The state was left by an outcome of its own before this port was written, and no instance can
-                    // still write it.
+                    // The state was left early by an outcome of its own, so nobody will write this port.
                     let missing = error.is_not_yet_known() && view.blocker().is_none();
                     let is_left_out = missing && !is_success(leaves_by) && !name.starts_with(ASSIGNED);
                     (!is_left_out).then(|| not_bound(view, &BindError::at(&what, state)(error)))
@@ -210,7 +209,7 @@ impl Window {
                 }
                 let is_made = !matches!(value, Err(Some(Readiness::Waits(_))));
                 if is_made {
-                    // A failure may come out differently later, too, so its inputs are registered.
+                    // A failure may come out differently, too.
                     view.use_outputs(view.sight.producers_of(view.instance));
                     view.register(Purpose::Result);
                 }

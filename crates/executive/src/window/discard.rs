@@ -70,7 +70,7 @@ impl Window {
         }
     }
 
-    /// Removes an instance that has left the window from all tables.
+    /// Forgets an instance that has left the window.
     pub(super) fn forget(&mut self, id: InstanceId) {
         self.dispatch.forget(id);
         self.results.forget(id);
@@ -145,8 +145,8 @@ impl Window {
         way
     }
 
-    /// Adds the way out of one line, up to the fork where it begins. Returns that fork, with the concurrency and its path. `own` is the state at
-    /// the line's head if it is not left yet, `within` the place inside of a routine there.
+    /// Adds the way out of one line, up to its fork, which is returned with the concurrency and its path. `own` is the state at the line's head
+    /// if it is not left yet, `within` the place inside of a routine there.
     fn add_way_out(
         &self,
         context: &Context<'_>,

@@ -186,7 +186,7 @@ impl Window {
         let limit = context.program.state(instance.state).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
         let (is_pia, attempt) = (instance.is_pia(), node.attempt);
         let is_held = is_pia && matches!(node.status, Status::Granted(_));
-        // A node that had not begun only loses its lease or projection, and asks again when it may begin.
+        // A node that had not begun only loses what it held, and asks again when it may.
         if !is_held {
             let crashes = self.graph.count_crash(id);
             if is_pia || crashes >= limit {
@@ -228,7 +228,7 @@ impl Window {
             self.look(context, id, None, |_, view| effects::actual(Some(declared), PREEMPTED, &[], view).ok());
         if let Some(changes) = changes.flatten() {
             let writer = self.path(context.program, id);
-            // An error does not matter: the run ends anyway.
+            // Errors do not matter: the run ends anyway.
             let _ = context.commit(id, writer, changes.into());
         }
     }

@@ -23,8 +23,8 @@ use ratn_model::id::InstanceId;
 use ratn_model::program::{SUCCESS, StateKind};
 use std::collections::BTreeSet;
 
-/// An instance waits this long, in seconds, before holders that only improve a result, or are speculative, give way to it, if it was not known that
-/// the resources do not suffice for both.
+/// An instance waits this long, in seconds, before improving or speculative holders give way, if it was not known that the resources do not suffice
+/// for both.
 const PATIENCE_S: f64 = 0.1;
 
 impl Window {
@@ -78,8 +78,8 @@ impl Window {
         }
     }
 
-    /// Stops improving, because the result is used, its resources are wanted, or the instance is discarded: cancels the goal; its best result
-    /// counts. Does nothing if the instance is not improving.
+    /// Stops improving, because the result is used, its resources are wanted, or it is discarded: cancels the goal; its best result counts. Does
+    /// nothing if it is not improving.
     pub(super) fn harvest(&mut self, context: &mut Context<'_>, id: InstanceId) {
         if let Some(improvement) = self.settle_best(id) {
             context.commands.push(Command::Cancel { instance: id, attempt: improvement.attempt });
@@ -104,8 +104,8 @@ impl Window {
         Some(improvement)
     }
 
-    /// A motion begins: stops improving the results that it uses, and stops sensing what it may change, because the sensor would see the motion.
-    /// True if any of them was still improving.
+    /// A motion begins: stops improving results that it uses, and sensing of what it may change, because the motion would be seen. True if any was
+    /// stopped.
     pub(super) fn harvest_for(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
         if self.improving.is_empty() {
             return false;

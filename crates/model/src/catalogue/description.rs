@@ -140,7 +140,7 @@ impl DescriptionError {
 }
 
 impl WorkerDescription {
-    /// Checks the description against the bounds and the rules for names and types.
+    /// Checks the description against these bounds.
     ///
     /// # Errors
     /// [`DescriptionError`] for the first violation.
@@ -221,8 +221,8 @@ fn check(action: &str, signature: &ActionSignature) -> Result<(), DescriptionErr
     })
 }
 
-/// Whether a default, as people write it, may have this type. Only plain constants are checked; anything else (a trajectory, a pose with a
-/// quaternion) is accepted without evaluation, because a few characters from outside could make a list of a million elements.
+/// Whether a default, as people write it, may have this type. Only plain constants are checked. Others (a trajectory, a pose with a
+/// quaternion) are accepted and not evaluated: a few characters from outside could make a list of a million elements.
 fn may_be(default: &str, expected: &Type) -> bool {
     if matches!(expected, Type::Any | Type::String) {
         return true;

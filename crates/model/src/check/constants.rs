@@ -1,5 +1,4 @@
-//! Constant expressions that have no value: an expression without variables, outputs and facts is evaluated here, with the same result as at run
-//! time.
+//! Constant expressions without a value: an expression without variables, outputs and facts is evaluated here as it will be at run time.
 
 use super::{Subject, named};
 use crate::catalogue::JointChain;

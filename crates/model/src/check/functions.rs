@@ -13,7 +13,7 @@ use std::collections::BTreeSet;
 
 /// From this length on a name may differ in two letters, a shorter one in one.
 const LONG_NAME: usize = 8;
-/// Functions with names up to this length are similar to too many words; they cause only a warning.
+/// Short names are similar to too many words; they cause only a warning.
 const SHORT_NAME: usize = 3;
 
 /// Functions of other languages that people write, with their replacement here. None of them exists here, and no task has facts with
@@ -119,7 +119,7 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
                     }
                     // Reported by `unestablished-precondition`.
                     (None, None) if matches!(slot, Slot::Requires(_)) => {}
-                    // The task waits for this fact, so somebody else writes it.
+                    // The task waits for it, so somebody else writes it.
                     (None, None) if awaited.contains(name) => {}
                     // Reported once per name: a fact that nothing writes is null wherever it is read.
                     (None, near) if told.insert(name.to_owned()) => {

@@ -398,7 +398,7 @@ impl ControlFlow {
                 Some(around) if decided(around, outcome).is_some() => {
                     decided(around, outcome).is_some_and(|holds| one_succeeds(holds, &BTreeSet::from([state.id])))
                 }
-                // With watches beside it, a single region determines how the concurrency ends.
+                // With watches beside it, this region alone decides.
                 Some(around) => {
                     let mut others = around.children().filter(|id| *id != state.id);
                     !others.all(|other| program.state(other).is_watch()) || self.gives((state.id, port), outcome)

@@ -83,7 +83,7 @@ fn nodes(program: &Program, state: &State) -> usize {
     }
 }
 
-/// The facts, variables and resources that the states of a region use.
+/// What the states of a region use.
 struct Touched<'a> {
     reads: Footprint,
     /// The path of the first computing state without `reads`.

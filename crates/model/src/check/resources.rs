@@ -54,7 +54,7 @@ fn offered(
         let is_implied =
             resource.kind == WORLD_MODEL && state.annotations.origin.get(WORLD_MODEL) == Some(&Origin::Reads);
         let help = if is_implied {
-            // The line is implied: no line of the task names the resource.
+            // No line of the task names it.
             "the state reads facts, and so needs room for a projection: offer it (`[catalogue.resources.WorldModel]`), or say `reads: []`".to_owned()
         } else {
             suggestion(&resource.kind, known, "", "offer it in the catalogue, or create it in an older state")
@@ -160,7 +160,7 @@ fn deletes_what_it_holds(subject: &Subject<'_>, state: &State, findings: &mut Fi
     }
 }
 
-/// `exists` is allowed for nodes only, because only nodes ask the resource manager.
+/// `exists` is for nodes only; only they ask the resource manager.
 fn exists_of_a_composite(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
     if matches!(state.kind, StateKind::Action { .. }) || state.is_routine() {
         return;

@@ -11,7 +11,7 @@ pub(super) type Flow<'e> = (StateId, &'e str);
 #[derive(Default)]
 pub(super) struct Ways<'e> {
     pub(super) needed: BTreeSet<Flow<'e>>,
-    /// For each `either`, the outputs that each argument needs.
+    /// By `either`, the outputs that each argument needs.
     pub(super) either: Vec<Vec<BTreeSet<Flow<'e>>>>,
 }
 

@@ -188,7 +188,7 @@ mod tests {
             changes.iter().map(ToString::to_string).collect::<Vec<_>>(),
             ["set at(a) = true", "set at(b) = true"]
         );
-        // The quantifier's variable hides an outer one of the same name, even if its value is unknown.
+        // The quantifier's variable hides an outer one, even if its value is unknown.
         let outside = BTreeMap::from([("b".to_owned(), Value::String("other".into()))]);
         assert_eq!(printed(EffectExpr::footprint(&at_each_box(), &outside)), ["at(?)"]);
     }

@@ -176,7 +176,7 @@ impl Expr {
             let value = match places.as_slice() {
                 [one] => row[*one].clone(),
                 several => {
-                    // In the body of a function, variables were renamed: the original name is the part before the space.
+                    // In the body of a function variables were renamed to `name of …`.
                     let fields = wanted.iter().map(|name| name.split(' ').next().unwrap_or_default().to_owned());
                     Value::Map(fields.zip(several.iter().map(|place| row[*place].clone())).collect())
                 }

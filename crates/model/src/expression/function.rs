@@ -21,7 +21,7 @@ const HELD_AROUND: [&str; 2] = ["Can", "Cup"];
 /// Limit of different elements in `unique`, because each element is compared with all found ones.
 const MAX_UNIQUE: usize = 1_000;
 
-/// Limit of turns: a planner takes at most this many alternatives.
+/// Limit of turns; a planner takes no more alternatives.
 const MAX_TURNS: i64 = 64;
 
 impl Function {
@@ -156,8 +156,8 @@ impl Function {
     }
 }
 
-/// The value of a call; the error says what is wrong with the arguments. `if` and `either` are evaluated elsewhere, because they do
-/// not evaluate all their arguments.
+/// The value of a call, or what is wrong with the arguments. `if` and `either` are evaluated elsewhere, because they skip
+/// arguments.
 pub(crate) fn call(function: Function, arguments: &[Value]) -> Result<Value, String> {
     if !function.takes(arguments.len()) {
         return Err(format!("expected `{}`", function.usage()));

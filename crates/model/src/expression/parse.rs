@@ -82,7 +82,7 @@ pub trait Names {
         false
     }
 
-    /// The expression that replaces a call of a function defined in the file.
+    /// Replaces a call of a function of the file.
     ///
     /// # Errors
     /// The number of arguments is wrong, or the result is too large.

@@ -36,8 +36,8 @@ pub trait Scope {
     fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
         self.outer().map_or(Lookup::Unknown, |outer| outer.fact(pattern))
     }
-    /// Visits the facts that match, in the order of keys, until `visit` returns false; it may visit others, too. Returns whether
-    /// the facts are known.
+    /// Visits the facts that match, in the order of keys, and possibly others, until `visit` returns false. Returns whether they
+    /// are known.
     fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
         self.outer().is_some_and(|outer| outer.each_fact(pattern, visit))
     }

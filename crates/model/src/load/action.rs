@@ -82,7 +82,7 @@ impl Ports {
     }
 }
 
-/// The keys for the nature of a state; one of them in the state replaces all of the action's.
+/// The keys for a state's nature; one replaces all.
 const NATURES: [&str; 3] = ["computes", "senses", "pia"];
 
 /// The sources of one state's annotations: first the state, then its action.
@@ -119,7 +119,7 @@ impl<'b> Sources<'b> {
         Sources { body: step.body, action: says(), origin: BTreeMap::new() }
     }
 
-    /// The annotation under a key, from the state or else from its action.
+    /// The annotation under a key, parsed.
     pub(crate) fn read<T: OfAction>(
         &mut self,
         fields: &mut Fields<'_, '_>,
@@ -133,8 +133,8 @@ impl<'b> Sources<'b> {
         self.of_action(fields, key, read)
     }
 
-    /// The effects of a state: its own, and its action's on other predicates. For every outcome other than success, facts that success would set are deleted if
-    /// the action leaves them unknown after a failure and the state declares no effect on that predicate for the outcome.
+    /// The effects of a state: its own, and its action's on other predicates. For outcomes other than success, facts that success would set are deleted if the
+    /// action leaves them unknown after a failure and the state declares no effect on that predicate.
     pub(crate) fn effects(
         &mut self,
         fields: &mut Fields<'_, '_>,

@@ -175,7 +175,7 @@ pub(crate) fn variables(fields: &mut Fields<'_, '_>, body: &Node) -> Vec<(String
     variables
 }
 
-/// Reads `assign: {n: $n + 1}`: assignments to variables of the states around it.
+/// Reads `assign: {n: $n + 1}`: variables of outer states.
 pub(crate) fn assign(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) -> Vec<(String, Expr)> {
     let mut assign = Vec::new();
     let inside = fields.view.inside;

@@ -1,8 +1,7 @@
 //! Libraries: a task file that is used as a state of another one.
 //!
 //! A library is loaded and checked separately, with its own name in messages. Then its states are inserted below the state
-//! that uses it. Its parameters become scoped variables, its outputs become output ports, its outcomes become outcomes of the
-//! state.
+//! that uses it. Its parameters become scoped variables, its outputs output ports, its outcomes outcomes.
 
 use super::fields::Fields;
 use super::outline::{Form, Outline};

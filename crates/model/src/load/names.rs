@@ -1,7 +1,7 @@
 //! Resolves names from the point of view of one state: variables of the loops around it, parameters, outputs of other states.
 //!
-//! The name of a state is looked up among the siblings of this state, then among those of the states around it, from inside out; then
-//! anywhere. A rule of `check` decides whether the state found can have written its port by then.
+//! A state's name is looked up among the siblings of this state and of those around it, from inside out; then anywhere. Whether the
+//! state found can have written its port by then is a rule of `check`.
 
 use super::functions::Functions;
 use super::outline::{Form, Outline};
@@ -42,7 +42,7 @@ pub(crate) struct Task<'a> {
     pub(crate) ontology: Option<Ontology>,
 }
 
-/// The place of an expression, which determines the names that it sees.
+/// Determines the names that an expression sees.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct View {
     /// The state; with `None` only parameters are visible.

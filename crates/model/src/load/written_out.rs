@@ -145,7 +145,7 @@ fn value(key: &str) -> Option<String> {
     (!key.contains(['"', '\\', '\n'])).then(|| format!("\"{key}\""))
 }
 
-/// Expands a fallback: each state leads to the next one if it fails, and leaves the list by success.
+/// Expands a fallback: each state leads to the next if it fails, and out by success.
 fn fallback(node: &mut Node, name: &str, findings: &mut Findings) {
     let at = node.at;
     let Content::Map(entries) = &mut node.content else { return };

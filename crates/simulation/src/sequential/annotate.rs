@@ -1,4 +1,4 @@
-//! States with missing annotations, and the annotations they would have if they read and changed nothing unnamed.
+//! Missing annotations of states, and their values if nothing unnamed is read or changed.
 
 use ratn_model::catalogue::Catalogue;
 use ratn_model::expression::FactExpr;

@@ -39,7 +39,7 @@ pub(super) fn chain(program: &Program, log: &[LogLine]) -> Vec<Link> {
     let mut at = last.max_by_key(|(id, visit)| (visit.ended, **id)).map(|(id, visit)| (*id, visit));
     while let Some((id, visit)) = at {
         let (Some(began), Some(ended)) = (visit.began, visit.ended) else { break };
-        // Among the visits that ended at that moment: the one with the closest bond, then the youngest.
+        // Of those that ended then: the closest bond, then the youngest.
         let before = visits
             .ended_at(began)
             .filter(|(other, earlier)| *other != id && earlier.began.is_some_and(|b| b < began))
@@ -88,8 +88,8 @@ impl Visits {
         self.by_end.get(&at).into_iter().flatten().map(|id| (*id, &self.all[id]))
     }
 
-    /// The visit that writes the outputs that a visit takes from `source`: the latest one before it, in the same iterations of the loops
-    /// around both; if `source` contains states, the visit inside that ended last.
+    /// The visit that writes what a visit takes from `source`: the latest before it, in the same iterations of the loops around both; if
+    /// `source` contains states, the inner visit that ended last.
     fn source(&self, program: &Program, source: StateId, behind: InstanceId) -> Option<InstanceId> {
         // The states around the source are also around the visit, in the same iterations and visits.
         let source = program.state(source);

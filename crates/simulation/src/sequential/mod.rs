@@ -27,11 +27,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Of the states with missing annotations, at most this number is examined, those with the longest durations …
+/// Limit of examined states; those with the longest durations are taken …
 const MAX_CANDIDATES: usize = 40;
 /// … and no more than give about this number of goals in all simulations together.
 const MAX_GOALS: usize = 20_000;
-/// Simulations per state: annotated alone, and all others annotated.
+/// Per state: it alone, and all but it.
 const SIMULATIONS: usize = 2;
 /// A smaller gain, in seconds, counts as none.
 const NO_GAIN_S: f64 = 1e-6;
@@ -86,7 +86,7 @@ pub struct Gain {
     pub last_s: f64,
 }
 
-/// Error: the task could not be simulated to its end.
+/// Error: the simulation did not succeed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Obstacle {
     /// The simulation failed.

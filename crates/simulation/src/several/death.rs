@@ -57,7 +57,7 @@ impl Gone {
     /// Keeps an event for the resumed task control.
     pub(super) fn keep(&mut self, now: Timestamp, event: Event) {
         match event {
-            // An unknown grant is given back on resuming; requests to give way and changes are covered then, too.
+            // Resuming gives back unknown grants, and compares the worlds.
             Event::Granted { .. } | Event::WantedByOthers { .. } | Event::WorldChanged { .. } => {}
             event => self.kept.push(self.as_it_ended(now, event)),
         }

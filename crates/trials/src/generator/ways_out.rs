@@ -75,7 +75,7 @@ fn limit(program: &mut Program, guards: &mut BTreeMap<StateId, Guard>, dice: &mu
             }
         }
         let limits = guards.entry(id).or_default().limits.get_or_insert_default();
-        // Chosen so that it never falls on the end of an action.
+        // Never at the end of an action.
         limits.timeout_s = Some(LONG_S * dice.below(4) as f64 + LONG_S / 20.0);
     }
 }

@@ -1,7 +1,7 @@
 //! The annotations in force for a state, from its own and its action's annotations: the rule of docs/task-files.md, implemented here independently.
 //!
-//! A state's annotation replaces its action's under the same key; `effects` are combined, predicate by predicate. An annotation that needs an input
-//! which the state does not give is not in force.
+//! A state's annotation replaces its action's under the same key; `effects` are combined by predicate. An annotation that needs an input which the
+//! state does not give is not in force.
 
 use ratn_model::expression::{EffectExpr, Expr, FactExpr};
 use ratn_model::program::{ABORTED, Annotations, Nature, PREEMPTED, ResourceExpr, SUCCESS, WORLD_MODEL};

@@ -102,7 +102,7 @@ fn performer(annotations: &Annotations) -> &str {
     annotations.resources.iter().find(blocks).map_or("Planner", |line| &line.kind)
 }
 
-/// The annotations as text, as if the state had all of them itself, for comparison.
+/// All annotations as a state would have them, for comparison.
 fn as_said(program: &Program, state: &State, all: &Annotations) -> String {
     let said = Said {
         nature: Some(all.nature.clone()),
@@ -130,7 +130,7 @@ fn divided(all: &Annotations, given: &Inputs, dice: &mut Dice) -> (Said, Said) {
     }
     if of_action {
         action.nature = match &all.nature {
-            // A catalogue cannot say that an action is irreversible. It says `computes` only if the state overrides that.
+            // A catalogue cannot say `irreversible`. It says `computes` only if the state overrides that.
             Nature::Irreversible => own.then_some(Nature::Computes),
             Nature::Computes => Some(Nature::Computes),
             Nature::Senses(facts) => of_inputs(facts, given).filter(|facts| !facts.is_empty()).map(Nature::Senses),
@@ -296,7 +296,7 @@ fn said_by_state(program: &Program, state: &State, said: &Said) -> Map<String, J
     keys
 }
 
-/// An action's annotations as texts of a catalogue.
+/// Annotations as texts of a catalogue.
 fn said_by_action(said: &Said) -> OfAction {
     let texts = |facts: &Vec<FactExpr>| facts.iter().map(ToString::to_string).collect::<Vec<_>>();
     let kind =

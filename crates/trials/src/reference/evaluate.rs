@@ -56,7 +56,7 @@ impl Place<'_> {
         Ok(FactPattern { predicate: fact.predicate.clone(), arguments })
     }
 
-    /// Whether the outputs in an expression exist, depending on the states on the way to this place.
+    /// Whether the outputs in an expression exist at this place.
     fn has(&self, expr: &Expr) -> Had {
         match expr {
             Expr::Call(Function::Either, ways) => self.way(ways).map_or(Had::Nothing, |way| self.has(way)),

@@ -86,7 +86,7 @@ impl Reference<'_> {
         let annotations = &state.annotations;
         loop {
             self.meets(state, &variables.to_vec())?;
-            // The run may be told to end while the action waits for its resources, even if they are refused, or for its projection.
+            // The action may be waiting for resources, even refused ones, or for its projection.
             self.may_be_cut()?;
             if !in_routine {
                 self.asks(state, variables)?;

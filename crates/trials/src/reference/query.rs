@@ -203,7 +203,7 @@ fn found(
     Ok(false)
 }
 
-/// Binds the variable, or compares it with the value if it is bound.
+/// Binds the variable, or compares it if bound.
 fn unify(name: &str, value: Value, place: &mut Place<'_>) -> bool {
     match place.row.iter().rev().find(|(known, _)| known == name) {
         Some((_, known)) => same(known, &value),

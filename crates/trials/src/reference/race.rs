@@ -31,9 +31,9 @@ pub(super) struct Races {
     now_s: f64,
     /// Possible delay: regions inside of one node take turns with blocked resources, and their order is not known here.
     late_s: f64,
-    /// The earliest moment at which one of them is decided, and its number; the outermost has number 0.
+    /// When the first of them is decided, and its number; the outermost is 0.
     until: Option<(f64, usize)>,
-    /// The watch of every race, if it has one.
+    /// The watch of every race.
     watches: Vec<Option<Watch>>,
     /// The race that cut this thread short.
     cut: Option<Cut>,

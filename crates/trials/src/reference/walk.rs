@@ -252,7 +252,7 @@ impl Reference<'_> {
                 return Ok(outcome);
             }
             if around.children().any(|child| self.program.state(child).is_between_tries()) {
-                // The run may be told to end in the pause, which is a place of its own even if the next try never begins.
+                // The pause is a place of its own, even if the next try never begins.
                 self.may_be_cut()?;
                 self.tell(&below(path, &visit("pause")), in_routine, SUCCESS, (Outputs::new(), Outputs::new()));
             }
@@ -295,8 +295,8 @@ impl Reference<'_> {
         Ok(if last == SUCCESS { outcome } else { last })
     }
 
-    /// Executes the `finally` of a state that is cut short, whatever its outcome; then the states around are left. After the run was
-    /// told to end, nothing counts as inside of a routine.
+    /// Executes the `finally` of a state that is cut short, then leaves the states around. After the run was told to end, nothing
+    /// counts as inside of a routine.
     fn cut_lastly(
         &mut self,
         finally: &Finally,
@@ -412,7 +412,7 @@ impl Reference<'_> {
             for output in state.outputs() {
                 match output.value.read(&self.place(variables, Some(&written))) {
                     Ok(value) => drop(written.insert(output.name.clone(), value)),
-                    // The state was left by an outcome of its own before this output was written.
+                    // The state was left early, before this was written.
                     Err(Fail::Unwritten(_)) if outcome != SUCCESS => {}
                     Err(problem) => return Err(problem),
                 }
@@ -442,7 +442,7 @@ impl Reference<'_> {
     }
 }
 
-/// Assigns new values; of several variables with the same name, the innermost is meant.
+/// Assigns new values, each to the innermost variable of its name.
 pub(super) fn assign(variables: &mut Variables, assigned: Vec<(String, Value)>) {
     for (name, value) in assigned {
         if let Some(variable) = variables.iter_mut().rev().find(|(known, _)| *known == name) {

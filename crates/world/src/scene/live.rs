@@ -50,8 +50,8 @@ impl LiveScene {
         Ok(scene)
     }
 
-    /// Updates the scene from world `before` to `after`, which is `before` with the changes; returns the number of individuals
-    /// examined. Costs the changes, and the objects that stand on what they move.
+    /// Follows the world from `before` to `after`, which is `before` with the changes; returns the number of individuals examined.
+    /// Costs the changes, and the objects on what they move.
     ///
     /// # Errors
     /// As [`Scene::of`]; the scene is then unchanged.

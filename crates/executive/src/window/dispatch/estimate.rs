@@ -10,8 +10,7 @@ use crate::window::growth::environment::Binding;
 use crate::window::memory::Sight;
 use ratn_model::id::InstanceId;
 
-/// Up to this many instances the window is estimated again whenever it has grown; a larger window, when it has grown by this
-/// share.
+/// Up to this size the window is estimated again whenever it has grown, beyond it when it has grown by this share.
 const ALWAYS_ESTIMATED: usize = 64;
 const ESTIMATED_SHARE: usize = 2;
 

@@ -15,7 +15,7 @@ use std::time::Duration;
 /// Holds, by the instance that is held back.
 pub(super) type Holds = BTreeMap<InstanceId, Hold>;
 
-/// The instances that begin first, and the latest end of the hold.
+/// The instances that begin first, and the hold's latest end.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Hold {
     until_begun: Vec<InstanceId>,
@@ -40,7 +40,7 @@ impl Dispatch {
         (before.into_keys().collect(), self.holds.iter().map(|(id, hold)| (*id, hold.until)).collect())
     }
 
-    /// Whether the instance is held: another one is still to begin before it.
+    /// Whether an instance is held for another one.
     pub(crate) fn is_held(&self, graph: &Graph, id: InstanceId) -> bool {
         self.holds.get(&id).is_some_and(|hold| hold.until_begun.iter().any(|other| is_to_begin(graph, *other)))
     }

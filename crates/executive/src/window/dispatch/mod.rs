@@ -1,8 +1,8 @@
 //! Dispatch: which instance gets resources first, and which speculative holder gives way.
 //!
-//! Certain instances come before speculative ones, then the longest remaining path decides (`estimate`), then program order. Look-ahead may
-//! have advised a better order. The urgency of a speculative node is multiplied by the probability of its path. Speculative nodes leave the
-//! last room for projections to others, and give back their resources when a certain node needs them.
+//! Certain instances come before speculative ones, then the longest remaining path counts (`estimate`), then program order; look-ahead may
+//! have advised a better order. A speculative node's urgency is multiplied by the probability of its path. Speculative nodes leave the last
+//! room for projections to others, and give way to certain nodes.
 
 mod estimate;
 mod holds;
@@ -71,7 +71,7 @@ impl Dispatch {
         Dispatch { capacity, made, removed, learned_s, active, speculative, in_rooms, stalled, holds, asked }
     }
 
-    /// Accounts for resources that the task creates, deletes or consumes.
+    /// Accounts for resource operations of the task.
     pub(crate) fn operated(&mut self, operations: &[Requirement]) {
         for operation in operations {
             let changed = match operation.operation {
@@ -136,7 +136,7 @@ impl Dispatch {
         self.holds.remove(&id);
     }
 
-    /// The path of an instance is decided. True if it was under way as speculative, so that its acquire needs a new priority.
+    /// The path is decided. True if the instance has to ask again as a certain one.
     pub(crate) fn became_certain(&mut self, id: InstanceId) -> bool {
         self.in_rooms.remove(&id);
         self.stalled.remove(&id);
@@ -168,7 +168,7 @@ impl Dispatch {
         if rooms <= 1 { None } else { Some((rooms - 1).saturating_sub(self.in_rooms.len())) }
     }
 
-    /// A node waits until there is room for its projection.
+    /// A node waits for room for its projection.
     pub(crate) fn stall(&mut self, id: InstanceId) {
         self.stalled.insert(id);
     }

@@ -7,7 +7,7 @@ use crate::interpreter::Interpreter;
 use crate::window::growth::environment::{Collector, Restored};
 
 impl Graph {
-    /// Collects the environments and producers of its instances.
+    /// Collects what its instances share.
     pub(crate) fn collect<'a>(&'a self, places: &mut Collector<'a>) {
         for instance in self.iter() {
             places.add(&instance.environment);

@@ -77,7 +77,7 @@ pub(crate) struct Node {
     /// Number of attempts that crashed.
     pub(crate) crashes: u32,
     pub(crate) not_before: Timestamp,
-    /// The facts and inputs on which its result is based.
+    /// The inputs of its result.
     pub(crate) seen: Option<Box<Seen>>,
     /// Whether its goal was under way when it ended.
     pub(crate) has_acted: bool,
@@ -98,7 +98,7 @@ pub(crate) enum Status {
     Expanded,
     /// Waits for the resource manager, with this priority.
     Acquiring { priority: i64 },
-    /// Has its resources, but has not begun, because the operator holds it.
+    /// Has its resources; the operator holds it.
     Granted(Held),
     /// Waits for the world pool.
     Projecting(Held),
@@ -110,7 +110,7 @@ pub(crate) enum Status {
     Finished(Box<Ended>),
 }
 
-/// The lease and projection that a node holds.
+/// What a node holds.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Held {
     #[serde(with = "leases")]
@@ -144,7 +144,7 @@ pub(crate) enum Role {
     Loop,
     /// The preconditions and variables of a composite state.
     Entry,
-    /// Outputs, assignments, effects and resource operations of a composite state when it is left.
+    /// The exit of a composite state.
     Exit,
     /// Where regions begin.
     Fork,
@@ -172,10 +172,10 @@ pub(crate) struct Ended {
 pub(crate) enum Changed {
     /// The declared effects of its outcome, with measured values and their evidence.
     Declared(Vec<(FactKey, Value)>, Evidence),
-    /// Exactly these changes: those of a routine on a projection. Empty for a routine in the actual world, which has
-    /// committed its changes already, and for a node that was never executed.
+    /// Exactly these: a routine on a projection. None for a routine in the actual world, which has committed already, and
+    /// for a node that was never executed.
     Exactly(Made),
-    /// No changes of its own, because it waited; these are the changes that the wait foresaw, as the root shows them.
+    /// None, because it waited; these are the changes that it foresaw, as the root shows them.
     Foreseen(Vec<Change>),
 }
 
@@ -238,7 +238,7 @@ impl Instance {
         }
     }
 
-    /// The facts and inputs on which its result is based.
+    /// The inputs of its result.
     pub(crate) fn seen(&self) -> Option<&Seen> {
         match &self.body {
             Body::Node(node) => node.seen.as_deref(),

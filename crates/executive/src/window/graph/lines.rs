@@ -139,8 +139,7 @@ impl Lines {
         self.all.get(&line).map_or(0, |line| line.idle_visits)
     }
 
-    /// An instance has retired after this number of visits; `started` tells whether it was started, which resets the
-    /// count.
+    /// An instance has retired after this number of visits; a started one resets the count.
     pub(super) fn count_visits(&mut self, line: LineId, visits: u32, started: bool) {
         if let Some(line) = self.all.get_mut(&line) {
             line.idle_visits = if started { 0 } else { line.idle_visits.saturating_add(visits) };

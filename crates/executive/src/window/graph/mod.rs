@@ -335,12 +335,12 @@ impl Graph {
         self.lines.idle_visits(line)
     }
 
-    /// An instance has retired after this number of visits; `started` tells whether it was started, which resets the count.
+    /// An instance has retired after this number of visits; a started one resets the count.
     pub(crate) fn count_visits(&mut self, line: LineId, visits: u32, started: bool) {
         self.lines.count_visits(line, visits, started);
     }
 
-    /// Detaches an imprecise PIA that runs, so that younger instances of its line may begin.
+    /// Detaches a running imprecise PIA, so that younger instances may begin.
     pub(crate) fn pass_over(&mut self, id: InstanceId) {
         let Some((node, line, position, next)) = self.instances.get_mut(id).and_then(|instance| {
             let (line, position, next) = (instance.line, instance.position, instance.arms.first()?.next);
@@ -391,7 +391,7 @@ impl Graph {
         }
     }
 
-    /// Sets the facts and inputs on which a result is based.
+    /// Sets the inputs of a result.
     pub(crate) fn set_seen(&mut self, id: InstanceId, seen: Option<Seen>) {
         let Some(instance) = self.instances.get_mut(id) else { return };
         let seen = seen.map(Box::new);

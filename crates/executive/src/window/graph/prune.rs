@@ -25,7 +25,7 @@ pub(crate) struct Pruned {
 }
 
 impl Graph {
-    /// Takes an arm of a decision: the others are lost. Also returns the instances that have become certain.
+    /// Takes an arm of a decision; the others are lost. Also returns what has become certain.
     pub(crate) fn take_arm(&mut self, id: InstanceId, taken: usize) -> (Pruned, Vec<InstanceId>) {
         let Some(instance) = self.instances.get_mut(id).filter(|instance| instance.arms.len() > taken) else {
             return Default::default();
@@ -49,7 +49,7 @@ impl Graph {
         pruned.segments = arms.iter().map(|arm| arm.segment).filter(|segment| *segment != own).collect();
         let mut next: Vec<InstanceId> = arms.iter().filter_map(|arm| arm.next).collect();
         if is_detached {
-            // The line has passed this instance: everything on it that has not retired is behind the instance.
+            // The line has passed it: everything that has not retired is behind it.
             pruned.lines = self.stop_line(line, &mut next);
             pruned.stopped_line = Some(line);
             let beside = self.detached.iter().filter_map(|id| self.instances.get(*id));

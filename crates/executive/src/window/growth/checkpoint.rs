@@ -5,7 +5,7 @@ use super::environment::{Collector, Restored};
 use crate::checkpoint::Broken;
 
 impl Growth {
-    /// Collects the environments and producers of its cursors.
+    /// Collects what its cursors share.
     pub(crate) fn collect<'a>(&'a self, places: &mut Collector<'a>) {
         self.cursors.iter().for_each(|cursor| places.add(&cursor.environment));
         self.regions.values().for_each(|regions| regions.collect(places));

@@ -97,7 +97,7 @@ pub(crate) struct Iteration {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Variables(Arc<Vec<(Arc<str>, Binding)>>);
 
-/// The value of a variable, or where it comes from.
+/// The value or source of a variable.
 #[derive(Debug, Clone)]
 pub(crate) enum Binding {
     Known(Value),
@@ -105,7 +105,7 @@ pub(crate) enum Binding {
     Assigned(Arc<Producer>),
 }
 
-/// First character of the ports in which assigned values are kept; no declared port begins with it.
+/// First character of ports with assigned values; no declared port begins with it.
 pub(crate) const ASSIGNED: char = '$';
 
 /// The output port in which an instance keeps the value that it assigns to a variable.

@@ -51,7 +51,7 @@ pub(crate) struct Growth {
     grown: usize,
 }
 
-/// Where a path goes on whose instance ended otherwise than computed ahead.
+/// Where a path continues that was left.
 pub(crate) struct Departure {
     pub(crate) environment: Environment,
     pub(crate) line: u64,

@@ -216,7 +216,7 @@ impl<'a> Sight<'a> {
         }
         let made = match bound {
             Ok(changes) => self.worked_out(&view, writer, link, place, changes),
-            // A wrong expression will end the instance `aborted`; until then nothing may depend on it.
+            // A wrong effect ends the instance `aborted`; until then nothing may depend on it.
             Err(EvaluateError::NotYetKnown { .. } | EvaluateError::Wrong { .. }) => Err(Blocked(writer.id)),
         };
         let part = match made {
@@ -461,7 +461,7 @@ enum Declared<'w> {
 }
 
 impl View<'_> {
-    /// Registers the view's instance as a user of everything that the view has used.
+    /// Registers the view's instance as a user of what it has used.
     pub(crate) fn register(&self, purpose: Purpose) {
         for (id, of) in self.take_used() {
             if let Some(used) = self.sight.graph.get(id).filter(|used| used.id != self.instance.id) {
@@ -470,7 +470,7 @@ impl View<'_> {
         }
     }
 
-    /// Notes that the view uses the outputs of these instances.
+    /// Notes outputs that the view uses.
     pub(crate) fn use_outputs(&self, of: impl IntoIterator<Item = InstanceId>) {
         of.into_iter().for_each(|id| self.note_used(id, Source::Outputs));
     }

@@ -11,7 +11,7 @@ pub(super) enum Condition {
     Fact(FactExpr, Says),
     /// The expression is true; facts in it may be absent.
     Test(Expr),
-    /// There is an answer to these conditions (true), or there is none (false).
+    /// There is an answer to these (true), or none (false).
     Answers(Vec<Condition>, bool),
 }
 

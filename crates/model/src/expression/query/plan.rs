@@ -34,7 +34,7 @@ pub(super) enum Slot {
     Any,
     /// A variable of the answer: bound before, or bound by the fact found.
     Variable(usize),
-    /// An expression that can be evaluated by then.
+    /// Can be evaluated by then.
     Computed(Expr),
 }
 
@@ -54,7 +54,7 @@ pub enum PlanError {
     /// No condition at all.
     #[error("the query is empty; write a condition, `at(?box) = ?pose`")]
     Empty,
-    /// A variable is used by tests only, so nothing binds it.
+    /// Only tests use a variable.
     #[error("`?{name}` in `{condition}` gets no value: no fact of the query has it as an argument or says it")]
     Unbound {
         /// Its name.

@@ -18,7 +18,7 @@ pub enum Flow {
     Enough,
 }
 
-/// Error: a query could not be answered; different from having no answers.
+/// Error: the query could not be answered.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RunError {
     /// A value is not known yet or cannot be computed.
