@@ -171,7 +171,6 @@ pub(crate) fn expected_s(state: &State, scope: &dyn Scope) -> Option<f64> {
 pub(crate) struct Seed(u64);
 
 impl Seed {
-    /// The seed of a run.
     pub(crate) fn of(run: u64) -> Seed {
         let mut seed = Seed(0xcbf2_9ce4_8422_2325);
         seed.add(&run.to_le_bytes());

@@ -16,9 +16,7 @@ pub(crate) struct Context<'a> {
     pub(crate) program: &'a Program,
     /// The static plan: what follows from the program alone.
     pub(crate) plan: &'a Plan,
-    /// The mirror of the root world model.
     pub(crate) root: &'a mut World,
-    /// Time of the event.
     pub(crate) now: Timestamp,
     /// The last instance id given.
     pub(crate) last_instance: &'a mut u64,

@@ -87,7 +87,6 @@ impl<'a> Subject<'a> {
         self.places.of(state.id, part, state.location)
     }
 
-    /// The location of an expression of a state in the file.
     pub(crate) fn place_of(&self, state: &State, slot: Slot<'_>) -> Location {
         self.place(state, &slot.to_string())
     }

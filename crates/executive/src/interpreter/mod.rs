@@ -157,7 +157,6 @@ struct Thread {
     cut_short: Option<CutShort>,
 }
 
-/// Phase of an action.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 enum Phase {
     /// The operator lets no PIA begin; it may already have its resources.
@@ -401,7 +400,6 @@ impl Interpreter {
         progress
     }
 
-    /// Replaces all breakpoints.
     pub(crate) fn break_at(&mut self, program: &Program, breakpoints: Vec<String>) {
         self.hold.break_at(program, breakpoints);
     }

@@ -61,7 +61,6 @@ impl Interpreter {
         regions.iter().all(|region| self.region_end(*region).is_some())
     }
 
-    /// Number of regions that ended with success.
     fn succeeded(&self, regions: &[u64]) -> usize {
         regions.iter().filter(|region| self.region_end(**region).is_some_and(|(outcome, _)| outcome == SUCCESS)).count()
     }

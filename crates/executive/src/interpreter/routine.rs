@@ -34,7 +34,6 @@ impl Interpreter {
         self.routines.get_mut(&self.threads.get(&thread)?.routine?)
     }
 
-    /// The routine has its resources: its parts begin.
     pub(super) fn begin_routine(&mut self, context: &mut Context<'_>, thread: u64) {
         if self.is_held(context, thread) {
             return self.hold_back(context, thread);

@@ -6,7 +6,6 @@
 
 use super::network::Demand;
 
-/// The lanes of all kinds.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Lanes {
     /// By kind.

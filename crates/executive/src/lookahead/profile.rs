@@ -14,7 +14,6 @@ pub(super) struct Profile {
 }
 
 impl Profile {
-    /// An empty profile.
     pub(super) fn new(lanes: Lanes) -> Profile {
         Profile { lanes, times: Vec::new(), free: Vec::new() }
     }

@@ -174,7 +174,6 @@ impl Plan {
         self.names.numbers.get(name).copied()
     }
 
-    /// All predicates and kinds.
     pub(crate) fn predicates(&self) -> impl Iterator<Item = Predicate> {
         0..self.width
     }

@@ -178,7 +178,6 @@ fn predicates(effects: &Effects, names: &mut Names) -> BTreeSet<Predicate> {
     }
 }
 
-/// All outcomes of a state.
 pub(super) fn every(ends: &Ends) -> Outcomes {
     let known = ends.names.iter().take(MAX_OUTCOMES).enumerate();
     known.fold(0, |all, (number, _)| all | 1 << number)

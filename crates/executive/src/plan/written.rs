@@ -56,7 +56,6 @@ impl Plan {
         horizon.next_power_of_two().clamp(FEWEST_BUCKETS, MOST_BUCKETS)
     }
 
-    /// Number of chains.
     pub(crate) fn chains(&self) -> usize {
         2 * self.width + self.buckets
     }

@@ -70,7 +70,6 @@ impl Window {
         }
     }
 
-    /// Forgets an instance that has left the window.
     pub(super) fn forget(&mut self, id: InstanceId) {
         self.dispatch.forget(id);
         self.results.forget(id);

@@ -76,7 +76,6 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use waits::{Timer, Wait, Waits};
 
-/// The end of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct End {
     pub(crate) outcome: String,
@@ -291,7 +290,6 @@ impl Window {
         }
     }
 
-    /// Replaces all breakpoints.
     pub(crate) fn break_at(&mut self, program: &Program, breakpoints: Vec<String>) {
         self.hold.break_at(program, breakpoints);
     }

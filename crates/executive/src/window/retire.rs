@@ -369,7 +369,6 @@ impl Window {
         self.tell(context, id, &news.users, &news.difference, news.is_open, false);
     }
 
-    /// A detached PIA has ended: retires it.
     pub(super) fn retire_detached(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let real = self.make_real(context, id);
         let news = self.news_of_real(context, id, &real);

@@ -107,7 +107,6 @@ pub(crate) struct WaitCell {
 }
 
 impl WaitCell {
-    /// What it waits for.
     pub(crate) fn wait(&self) -> Wait {
         self.wait
     }

@@ -4,7 +4,6 @@ use crate::expression::{Expr, Function};
 use crate::id::StateId;
 use std::collections::BTreeSet;
 
-/// An output of a state.
 pub(super) type Flow<'e> = (StateId, &'e str);
 
 /// The outputs that an expression always needs, and its `either` choices.

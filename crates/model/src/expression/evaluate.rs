@@ -61,7 +61,6 @@ impl Expr {
         }
     }
 
-    /// The error for this expression.
     pub(crate) fn wrong(&self, problem: impl Into<String>) -> EvaluateError {
         EvaluateError::Wrong { expression: self.to_string(), problem: problem.into() }
     }

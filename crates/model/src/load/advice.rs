@@ -4,7 +4,6 @@
 use super::yaml::InvalidYaml;
 use crate::program::Location;
 
-/// The advice for an error.
 pub(super) fn advice(source: &str, error: &InvalidYaml) -> String {
     let lines: Vec<&str> = source.lines().collect();
     let index = (error.at.line as usize).saturating_sub(1);

@@ -292,7 +292,6 @@ fn changed(node: &Node, body: &Node, key: &str, value: Option<&Document>, index:
     }
 }
 
-/// A change to a text.
 struct Change<'c> {
     lines: Lines<'c>,
     body: &'c Node,

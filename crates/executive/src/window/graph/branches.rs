@@ -25,7 +25,6 @@ struct Branch {
     members: Vec<InstanceId>,
 }
 
-/// The open branches.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(super) struct Branches {
     all: BTreeMap<SegmentId, Branch>,
@@ -64,7 +63,6 @@ impl Branches {
         self.all.is_empty()
     }
 
-    /// Whether a decision on the way to a segment is open.
     pub(super) fn is_open(&self, segment: SegmentId) -> bool {
         self.all.contains_key(&segment)
     }

@@ -133,7 +133,6 @@ pub(crate) struct Marker {
     pub(crate) seen: Option<Box<Seen>>,
 }
 
-/// The role of a marker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Role {
     /// Decides between two branches.

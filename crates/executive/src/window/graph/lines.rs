@@ -54,7 +54,6 @@ impl Lines {
         self.all.range(from..).find(|(_, line)| line.is_active).map(|(id, _)| *id)
     }
 
-    /// The head of a line, unless the line waits for regions.
     pub(super) fn head(&self, line: LineId) -> Option<InstanceId> {
         self.all.get(&line).filter(|line| line.open_regions == 0)?.head
     }
@@ -104,7 +103,6 @@ impl Lines {
         line.head
     }
 
-    /// The line waits for this number of regions.
     pub(super) fn wait_for_regions(&mut self, line: LineId, regions: usize) {
         if let Some(line) = self.all.get_mut(&line) {
             line.open_regions = regions;

@@ -321,7 +321,6 @@ impl Graph {
         }
     }
 
-    /// The end of a region has retired.
     pub(crate) fn end_region(&mut self, region: LineId) {
         let Some(fork) = self.lines.remove(region).and_then(|fork| self.forks.get(&fork)) else { return };
         let (line, join) = (fork.line, fork.join);

@@ -43,7 +43,6 @@ impl Graph {
         }
     }
 
-    /// The node has its projection.
     pub(crate) fn projected(&mut self, id: InstanceId, projection: ProjectionId) {
         if let Some(node) = self.node_mut(id) {
             let held = node.status.take_held();

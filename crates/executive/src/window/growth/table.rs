@@ -40,7 +40,6 @@ impl<T: Clone> Table<T> {
         Table { depth, root: None }
     }
 
-    /// The value at an index.
     pub(crate) fn get(&self, index: usize) -> Option<&T> {
         let mut node = self.root.as_deref()?;
         let mut level = self.depth;
@@ -53,7 +52,6 @@ impl<T: Clone> Table<T> {
         }
     }
 
-    /// Sets or removes the value at an index.
     pub(crate) fn set(&mut self, index: usize, value: Option<T>) {
         set(&mut self.root, self.depth, index, value);
     }

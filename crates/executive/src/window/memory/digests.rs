@@ -20,7 +20,6 @@ pub(super) struct Digests {
     kept: BTreeMap<Option<FactPattern>, Sum>,
 }
 
-/// The sum of some facts.
 #[derive(Debug, Default)]
 struct Sum {
     facts: BTreeMap<FactKey, u128>,

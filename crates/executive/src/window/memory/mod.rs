@@ -133,7 +133,6 @@ impl MemoryCell {
         !self.users.borrow().is_empty()
     }
 
-    /// Removes all users.
     pub(crate) fn forget_users(&self) {
         self.users.borrow_mut().clear();
     }

@@ -39,7 +39,6 @@ impl Seen {
         self.inputs == other.inputs && self.facts == other.facts && self.read == other.read
     }
 
-    /// Whether the same facts were seen.
     pub(crate) fn saw_the_same(&self, other: &Seen) -> bool {
         self.facts == other.facts && self.read == other.read
     }

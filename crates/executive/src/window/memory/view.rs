@@ -21,7 +21,6 @@ use std::cell::{Cell, RefCell};
 /// The changes by one writer, effect by effect.
 pub(super) type ByWriter = (InstanceId, SmallVec<[Chunk; 2]>);
 
-/// The view of one instance.
 pub(crate) struct View<'a> {
     pub(crate) sight: Sight<'a>,
     pub(crate) instance: &'a Instance,
