@@ -39,7 +39,7 @@ pub struct Origin {
     /// Id of the run: the first part of every idempotent id, and the id of its session with the resource manager. Empty if the run cannot be resumed.
     #[serde(default)]
     pub run: String,
-    /// Number that the resource manager gave to the run's first session. A session that is opened anew under the same id has another number. 0 in logs
+    /// Number that the resource manager gave to the run's first session. A session that is opened again under the same id has another number. 0 in logs
     /// of earlier versions.
     #[serde(default)]
     pub session: u64,
@@ -86,7 +86,7 @@ pub struct Natures {
     pub changes_at_exit: Vec<String>,
 }
 
-/// What happened.
+/// An event for the executive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub enum Event {
@@ -261,7 +261,7 @@ pub enum Event {
         #[serde(default, skip_serializing_if = "std::ops::Not::not")]
         unknown: bool,
     },
-    /// The resource manager or the world pool refused an operation or commit of a retirement.
+    /// The resource manager or the world pool did not perform an operation or commit of a retirement.
     RetirementFailed {
         /// The instance.
         instance: InstanceId,
@@ -579,7 +579,7 @@ pub struct Goal {
 pub struct LogLine {
     /// When, in the robot's time since the start of the run.
     pub at: Timestamp,
-    /// What.
+    /// The event or command.
     #[serde(flatten)]
     pub entry: LogEntry,
 }

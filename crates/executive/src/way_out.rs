@@ -2,7 +2,7 @@
 //!
 //! The entered states that have a `finally` are left one after the other, the innermost first. First the states inside declare how being cut
 //! short changed the world (`effects: {preempted: […]}`), then the `finally` block is executed, by the sequential interpreter on the actual
-//! world, in both modes. A `finally` that was already under way is begun anew. Then the run ends.
+//! world, in both modes. A `finally` that was already under way is begun again. Then the run ends.
 //!
 //! ```text
 //! told to end ─► what is under way is cancelled ─► each `finally`, the innermost first ─► the end

@@ -44,7 +44,7 @@ pub struct SceneObject {
     pub name: String,
     /// Its shape.
     pub shape: Shape,
-    /// Where it is.
+    /// Its place.
     pub placement: Placement,
 }
 

@@ -4,7 +4,7 @@
 //! one population are scheduled in the direction of the other and join it (Debels, Vanhoucke: A bi-population based genetic algorithm for the
 //! resource-constrained project scheduling problem, 2005). So each generation justifies the one before it with one schedule per child, where double
 //! justification needs two more. A child replaces the individual at its mother's position in that population, unless that one is better. When there
-//! is no improvement for long, all but the best are drawn anew.
+//! is no improvement for long, all but the best are replaced by random ones.
 
 use super::project::{Plan, Project};
 use super::schedule::Scheduler;
@@ -13,7 +13,7 @@ use super::variation::{Direction, Variation};
 /// Size of each population: for up to 60 tasks as many as Hartmann's for some thousand schedules; for more tasks two for each three of them, up to
 /// the second number. Measured on PSPLIB: with 3,000 schedules twice as many are worse for 120 tasks, with 30,000 a little better.
 const SIZES: [usize; 2] = [40, 80];
-/// After this many schedules per individual without an improvement, all but the best are drawn anew.
+/// After this many schedules per individual without an improvement, all but the best are replaced by random ones.
 const PATIENCE: usize = 75;
 /// A given list costs three schedules: its own, and its justification to the end and back.
 const SCHEDULES_OF_GIVEN: usize = 3;
@@ -205,7 +205,7 @@ impl Population {
         }
     }
 
-    /// No more improvement: draws all anew but the best.
+    /// No more improvement: replaces all but the best by random ones.
     fn begin_anew(&mut self) {
         self.early.clear();
         self.late.clear();

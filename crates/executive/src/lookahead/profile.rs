@@ -18,7 +18,7 @@ impl Profile {
         Profile { lanes, times: Vec::new(), free: Vec::new() }
     }
 
-    /// Begins anew.
+    /// Empties it.
     pub(super) fn clear(&mut self) {
         self.times.clear();
         self.free.clear();

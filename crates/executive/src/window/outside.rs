@@ -118,7 +118,7 @@ impl Window {
         decides.unwrap_or(false)
     }
 
-    /// Decides again: what is behind is discarded and expanded anew.
+    /// Decides again: what is behind is discarded and expanded again.
     fn reopen(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.cut_behind(context, id);
         self.graph.reopen(id);

@@ -161,7 +161,7 @@ impl Dispatch {
         !graph.is_speculative(instance.segment) || !needs() || self.free_rooms().is_none_or(|free| free > 0)
     }
 
-    /// Number of further projections for speculative nodes; `None` if the number of rooms is unknown or 1.
+    /// Number of further projections for speculative nodes; `None` if the number of rooms is unknown or at most 1.
     fn free_rooms(&self) -> Option<usize> {
         let rooms = self.capacity.get(WORLD_MODEL)?.units() as usize;
         // One room is left to certain nodes, if there are several.

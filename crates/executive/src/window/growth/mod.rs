@@ -202,7 +202,7 @@ impl Growth {
         self.produce(context, index, producer, state, outcome);
     }
 
-    /// An instance decides again: expands the paths behind it anew.
+    /// An instance decides again: expands the paths behind it again.
     pub(crate) fn reopen(&mut self, graph: &mut Graph, context: &Context<'_>, id: InstanceId) {
         let Some(instance) = graph.get(id) else { return };
         let (line, segment, position) = (instance.line, instance.segment, instance.position);

@@ -28,7 +28,7 @@ struct RegionExit {
     because: Option<Arc<str>>,
 }
 
-/// A fork whose join may still be lost with an end of a region, and is then expanded anew.
+/// A fork whose join may still be lost with an end of a region, and is then expanded again.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Regions {
     /// The concurrency and its visit.
