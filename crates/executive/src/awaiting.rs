@@ -1,4 +1,4 @@
-//! What a wait under way waits for, and how it ends. Both modes ask here; when they look is theirs.
+//! What a waiting state waits for, and how its wait ends. Both modes call this, each at its own times.
 
 use crate::binding::{self, BindError, Outputs};
 use crate::protocol::Awaited;
@@ -17,11 +17,11 @@ use ratn_world::world::World;
 pub(crate) struct WaitEnd {
     pub(crate) outcome: String,
     pub(crate) outputs: Outputs,
-    /// Why, where that is not what was waited for.
+    /// Reason, if the wait ended otherwise than by what it waited for.
     pub(crate) reason: String,
 }
 
-/// What a wait waits for that begins now, and until when at most.
+/// What a wait that begins now is waiting for, and its latest end.
 pub(crate) fn begins(
     state: &State,
     now: Timestamp,
@@ -65,7 +65,8 @@ pub(crate) fn begins(
     })
 }
 
-/// How a wait for a condition ends, if the world is now as it ends it; `None`: it goes on. Waits for anything else go on, too.
+/// How a wait for a condition ends in the present world. `None`: the condition does not hold yet, or the state waits for
+/// something else.
 pub(crate) fn has_come(state: &State, scope: &dyn Scope) -> Result<Option<WaitEnd>, BindError> {
     match state.wait() {
         Some(Wait::Condition(condition)) => {
@@ -80,7 +81,7 @@ pub(crate) fn has_come(state: &State, scope: &dyn Scope) -> Result<Option<WaitEn
     }
 }
 
-/// How a wait ends for which a signal was kept, which it takes.
+/// How a wait for a signal ends: takes the oldest kept signal of its name, if there is one.
 pub(crate) fn takes(state: &State, signals: &mut Signals) -> Option<WaitEnd> {
     match state.wait() {
         Some(Wait::Signal(name)) => Some(success([(VALUE.to_owned(), signals.take(name)?)].into())),
@@ -88,12 +89,12 @@ pub(crate) fn takes(state: &State, signals: &mut Signals) -> Option<WaitEnd> {
     }
 }
 
-/// How a wait ends whose time is up.
+/// How a wait ends when its time is up.
 pub(crate) fn is_up(state: &State) -> WaitEnd {
     let late = |outputs| WaitEnd { outcome: TIMEOUT.to_owned(), outputs, reason: String::new() };
     match state.wait() {
         Some(Wait::Limit(seconds)) => cut_short(ABORTED, format!("it took longer than {seconds} s")),
-        // Nothing but a condition ends it.
+        // Only its condition ends a watch.
         Some(Wait::Watch(_)) | None | Some(Wait::Seconds(_) | Wait::Until(_)) => success(Outputs::new()),
         Some(Wait::Condition(_)) => late(Outputs::new()),
         Some(Wait::Signal(_)) => late([(VALUE.to_owned(), Value::Null)].into()),
@@ -104,7 +105,7 @@ pub(crate) fn is_up(state: &State) -> WaitEnd {
     }
 }
 
-/// How a question ends that was answered so; `None` where that is no choice of it.
+/// How a question ends when answered with `choice`; `None` if it does not offer that.
 pub(crate) fn answered(state: &State, choice: &str) -> Option<WaitEnd> {
     match state.wait() {
         Some(Wait::Answer(question)) if question.choices.contains(&choice) => Some(chosen(state, choice)),
@@ -112,7 +113,7 @@ pub(crate) fn answered(state: &State, choice: &str) -> Option<WaitEnd> {
     }
 }
 
-/// A choice is an outcome where the state has it.
+/// The choice is the outcome if the state has one of that name.
 fn chosen(state: &State, choice: &str) -> WaitEnd {
     let is_outcome = state.outcomes.iter().any(|outcome| outcome == choice);
     let outcome = if is_outcome { choice } else { SUCCESS };
@@ -124,12 +125,12 @@ fn success(outputs: Outputs) -> WaitEnd {
     WaitEnd { outcome: SUCCESS.to_owned(), outputs, reason: String::new() }
 }
 
-/// The state that was watched ends before its own end.
+/// An end without outputs: a `while` condition does not hold, or a timeout.
 pub(crate) fn cut_short(outcome: &str, reason: String) -> WaitEnd {
     WaitEnd { outcome: outcome.to_owned(), outputs: Outputs::new(), reason }
 }
 
-/// What a wait that has ended so was taken to change, as the root shows it now. Nothing of it is made by the wait.
+/// The effects that the wait's condition foresees, with the values that the root shows now. The wait itself changes nothing.
 pub(crate) fn as_it_is(foreseen: Option<&Vec<EffectExpr>>, scope: &dyn Scope, root: &World) -> Vec<Change> {
     let bound = foreseen.and_then(|effects| EffectExpr::bind(effects, scope).ok()).unwrap_or_default();
     let now = |pattern: FactPattern| {

@@ -20,7 +20,7 @@ pub(crate) trait Names {
     fn variable(&self, name: &str) -> Option<Cow<'_, Value>>;
     /// `state.port`
     fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>>;
-    /// Whether `state.port` is there.
+    /// Whether `state.port` has a value.
     fn given(&self, state: StateId, port: &str) -> Given;
 }
 
@@ -72,7 +72,7 @@ impl Scope for Bindings<'_> {
     }
 }
 
-/// Why an expression of a state has no value, with the part of the state it stands in.
+/// Error: an expression of a state has no value. It names the part of the state.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{part} of {path}")]
 pub(crate) struct BindError {
@@ -109,7 +109,7 @@ pub(crate) fn inputs(state: &State, inputs: &[(String, Expr)], scope: &dyn Scope
     Ok(bound)
 }
 
-/// What a state asks for, evaluated.
+/// The requirements of a state, evaluated.
 pub(crate) fn requirements(
     state: &State,
     wanted: &[ResourceExpr],
@@ -118,7 +118,7 @@ pub(crate) fn requirements(
     wanted.iter().map(|r| r.bind(scope).map_err(BindError::at(format_args!("resource `{}`", r.kind), state))).collect()
 }
 
-/// Why a state may not start: the first of its preconditions that does not hold; `Ok(None)` when all hold.
+/// The first precondition (`requires`) that does not hold, as a reason; `Ok(None)` when all hold.
 pub(crate) fn unmet(state: &State, scope: &dyn Scope) -> Result<Option<String>, BindError> {
     for requirement in &state.annotations.requires {
         if !requirement.holds(scope).map_err(BindError::at("`requires`", state))? {
@@ -128,12 +128,12 @@ pub(crate) fn unmet(state: &State, scope: &dyn Scope) -> Result<Option<String>, 
     Ok(None)
 }
 
-/// Why a state has to end: the first of its conditions that does not hold; `Ok(None)` when all hold.
+/// The first `while` condition that does not hold, as a reason; `Ok(None)` when all hold.
 pub(crate) fn violated(state: &State, scope: &dyn Scope) -> Result<Option<String>, BindError> {
     not_holding(&state.annotations.holds, scope).map_err(BindError::at("`while`", state))
 }
 
-/// The first of some conditions that does not hold, as a sentence.
+/// The first condition that does not hold, as a sentence.
 pub(crate) fn not_holding<'e>(
     conditions: impl IntoIterator<Item = &'e Expr>,
     scope: &dyn Scope,
@@ -146,7 +146,7 @@ pub(crate) fn not_holding<'e>(
     Ok(None)
 }
 
-/// Checks what a provider returned against the declared output ports.
+/// The first declared output port that is missing, or has a value of another type, as a reason.
 pub(crate) fn missing_output(
     declared: &BTreeMap<String, ratn_model::value::Type>,
     outputs: &Outputs,
@@ -160,32 +160,31 @@ pub(crate) fn missing_output(
     })
 }
 
-/// The declared estimate of a state's duration, in seconds; `None` where it says none or it is not known here.
+/// The declared estimate of a state's duration, in seconds; `None` if there is none, or its value is not known yet.
 pub(crate) fn expected_s(state: &State, scope: &dyn Scope) -> Option<f64> {
     let seconds = state.annotations.duration_s.as_ref()?.evaluate(scope).ok()?.as_number()?;
     (seconds.is_finite() && seconds >= 0.0).then_some(seconds)
 }
 
-/// A seed for one try of one visit, the same in every mode and on every host: FNV-1a over the run's seed, the path, part by
-/// part, and, from the second on, the number of the try.
+/// A random seed for one try of one visit, the same in every mode and on every host: FNV-1a over the run's seed, the parts
+/// of the path, and, from the second try on, the number of the try.
 pub(crate) struct Seed(u64);
 
 impl Seed {
-    /// Of a run.
     pub(crate) fn of(run: u64) -> Seed {
         let mut seed = Seed(0xcbf2_9ce4_8422_2325);
         seed.add(&run.to_le_bytes());
         seed
     }
 
-    /// Of a visit whose path goes on so.
+    /// Adds the next part of the visit's path.
     pub(crate) fn add(&mut self, bytes: &[u8]) {
         for byte in bytes {
             self.0 = (self.0 ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01b3);
         }
     }
 
-    /// Of a try, counted from 1.
+    /// The seed of one try, counted from 1.
     pub(crate) fn of_try(mut self, number: u32) -> u64 {
         if number > 1 {
             self.add(&number.to_le_bytes());

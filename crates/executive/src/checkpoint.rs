@@ -1,7 +1,7 @@
-//! What the forms of a checkpoint have in common: things behind an `Arc` are written once, and leases and requirements, which JSON
-//! leaves the empty parts of out, in full.
+//! Shared parts of the serialized forms of a checkpoint. A value behind an `Arc` is written once. Leases and requirements are
+//! written in full, because their JSON form leaves out empty parts.
 //!
-//! What a checkpoint is, and what of the state is not in it, says [`crate::executive::Executive::checkpoint`].
+//! What a checkpoint contains, and what of the state it leaves out: [`crate::executive::Executive::checkpoint`].
 
 use ratn_model::condition::Condition;
 use ratn_model::id::{FencingToken, LeaseId};
@@ -11,13 +11,13 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Bytes that are no checkpoint of this program: what is wrong with them.
+/// Error: these bytes are no checkpoint of this program; the text says what is wrong.
 pub(crate) type Broken = &'static str;
 
-/// The forms of things that several share, each once, in the order in which they were met.
+/// The serialized forms of values that several owners share, each once, in the order of their first use.
 #[derive(Debug)]
 pub(crate) struct Pool<F> {
-    /// By address. Nothing of it is written, so what is written depends on the state alone.
+    /// Places by address. Addresses are not written, so the bytes depend on the state alone.
     places: BTreeMap<usize, u32>,
     forms: Vec<F>,
 }
@@ -29,12 +29,12 @@ impl<F> Default for Pool<F> {
 }
 
 impl<F> Pool<F> {
-    /// The place of something that was met before.
+    /// The place of a value that was added before.
     pub(crate) fn find<T>(&self, shared: &Arc<T>) -> Option<u32> {
         self.places.get(&Arc::as_ptr(shared).addr()).copied()
     }
 
-    /// Gives something a place.
+    /// Adds a value and returns its place.
     pub(crate) fn add<T>(&mut self, shared: &Arc<T>, form: F) -> u32 {
         let place = u32::try_from(self.forms.len()).unwrap_or(u32::MAX);
         self.places.insert(Arc::as_ptr(shared).addr(), place);
@@ -47,7 +47,7 @@ impl<F> Pool<F> {
     }
 }
 
-/// What was written at a place.
+/// The value that was written at a place.
 pub(crate) fn at<T: Clone>(all: &[T], place: u32, broken: Broken) -> Result<T, Broken> {
     usize::try_from(place).ok().and_then(|place| all.get(place)).cloned().ok_or(broken)
 }
@@ -55,7 +55,7 @@ pub(crate) fn at<T: Clone>(all: &[T], place: u32, broken: Broken) -> Result<T, B
 type ResourceForm = (String, String, String, Vec<String>);
 type LeaseForm = (LeaseId, FencingToken, Vec<ResourceForm>);
 
-/// A lease, if there is one.
+/// Serialization of an optional lease.
 pub(crate) mod leases {
     use super::{Deserialize, Deserializer, Lease, LeaseForm, LeasedResource, Serialize, Serializer};
     use std::borrow::Borrow;
@@ -84,7 +84,7 @@ pub(crate) mod leases {
 type RequirementForm =
     (ResourceOperation, String, Option<ResourceClass>, BTreeMap<String, Value>, Quantity, bool, Vec<Condition>);
 
-/// What is asked of the resource manager.
+/// Serialization of requirements to the resource manager.
 pub(crate) mod requirements {
     use super::{Deserialize, Deserializer, Requirement, RequirementForm, Serialize, Serializer};
 

@@ -11,14 +11,12 @@ use ratn_model::time::Timestamp;
 use ratn_world::world::World;
 use serde::{Deserialize, Serialize};
 
-/// What every part of the executive works with.
+/// The state that every part of the executive works with.
 pub(crate) struct Context<'a> {
     pub(crate) program: &'a Program,
-    /// What follows from the program alone.
+    /// The static plan: what follows from the program alone.
     pub(crate) plan: &'a Plan,
-    /// The mirror of the root world model.
     pub(crate) root: &'a mut World,
-    /// The moment of the event.
     pub(crate) now: Timestamp,
     /// The last instance id given.
     pub(crate) last_instance: &'a mut u64,
@@ -26,7 +24,7 @@ pub(crate) struct Context<'a> {
     pub(crate) seed: u64,
     /// The signals that no wait has taken.
     pub(crate) signals: &'a mut Signals,
-    /// What the shell shall do.
+    /// Commands for the shell.
     pub(crate) commands: &'a mut Vec<Command>,
 }
 
@@ -40,7 +38,7 @@ impl Context<'_> {
         self.commands.push(Command::Note(note));
     }
 
-    /// Whether the task's ontology allows a world to change so; a task without one allows everything.
+    /// Checks changes against the task's ontology; without an ontology every change is allowed.
     pub(crate) fn allows(&self, world: &World, made: &Made) -> Result<(), String> {
         let Some(ontology) = &self.program.ontology else { return Ok(()) };
         world.admits(ontology, &made.changes).map_err(|violation| violation.to_string())?;
@@ -54,7 +52,7 @@ impl Context<'_> {
         Ok(())
     }
 
-    /// Makes changes real: in the mirror now, in the world pool by command. `writer` is the path of who makes them.
+    /// Commits changes: at once in the mirror, by a command in the world pool. `writer` is the path of their writer.
     pub(crate) fn commit(&mut self, instance: InstanceId, writer: String, made: Made) -> Result<(), String> {
         if made.changes.is_empty() {
             return Ok(());
@@ -62,14 +60,14 @@ impl Context<'_> {
         self.allows(self.root, &made)?;
         let Made { changes, mut evidence } = made;
         let revision = self.root.apply(&changes).map_err(|e| e.to_string())?;
-        // What is measured and then deleted, or was not declared, is not written.
+        // No evidence for facts that were deleted after they were measured, or that were not declared.
         evidence.retain(|(fact, _)| self.root.fact(fact).is_some_and(|fact| fact.revision == revision));
         self.commands.push(Command::Commit { instance, writer, changes, evidence, revision });
         Ok(())
     }
 }
 
-/// What a node has changed, and what measured which of it.
+/// The changes made by a node, and their evidence.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Made {
     pub(crate) changes: Vec<Change>,
@@ -82,12 +80,12 @@ impl From<Vec<Change>> for Made {
     }
 }
 
-/// More visits than this without an action between them, and the task goes in circles. Each thread of control counts its own: one per
-/// state that is entered and one per iteration that begins. The count is 0 again when the goal of an action is started, and where a
+/// Limit of visits without an action; beyond it the run ends, because the task goes in circles. Each thread of control has its own
+/// count: one per state entered and one per iteration begun. The count returns to 0 when the goal of an action starts, and where a
 /// routine begins and ends.
 pub(crate) const MAX_IDLE_VISITS: u32 = 100_000;
 
-/// Why a run ends that goes on without an action: `path` is that of the innermost list it is in.
+/// Reason with which a run ends that goes in circles; `path` is the path of its innermost list.
 pub(crate) fn in_circles(path: &str) -> String {
     let place = if path.is_empty() { String::new() } else { format!("{path}: ") };
     format!("{place}the task goes in circles without doing anything; does what its loop looks at ever change?")

@@ -6,38 +6,38 @@ use ratn_model::fact::{Change, FactKey};
 use ratn_model::program::{SUCCESS, State};
 use ratn_model::value::Value;
 
-/// The declared effects of an outcome; `None` when the state may write everything then.
+/// The declared effects of an outcome; `None` if the state may then write every fact.
 pub(crate) fn declared<'a>(state: &'a State, nature: NodeNature, outcome: &str) -> Option<&'a [EffectExpr]> {
     match state.annotations.effects.get(outcome) {
         Some(effects) => Some(effects),
-        // A node that only computes changes nothing, and one that failed to sense has learned nothing, unless it says so.
+        // Without a declaration, a computing node changes nothing, and a sensing node that failed has learned nothing.
         None if nature == NodeNature::Computes => Some(&[]),
         None if nature == NodeNature::Senses && outcome != SUCCESS => Some(&[]),
         None => None,
     }
 }
 
-/// A finished node's changes that cannot be made.
+/// Error: the changes of a finished node cannot be made.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub(crate) enum EffectError {
-    /// An effect's expression has no value even now.
+    /// An effect's expression has no value even though the node has finished.
     #[error("an effect cannot be evaluated: {0}")]
     Evaluate(#[from] EvaluateError),
-    /// A fact was measured that no effect of this outcome declares.
+    /// A provider measured a fact that no effect of this outcome declares.
     #[error(
         "it measured {fact} = {value}, which none of its effects for outcome `{outcome}` declares; declare it, or drop the effects annotation"
     )]
     Undeclared {
-        /// Which fact.
+        /// The fact.
         fact: String,
-        /// What was measured.
+        /// The measured value.
         value: String,
         /// The outcome.
         outcome: String,
     },
 }
 
-/// Declared effects bound in `scope`, each measured value in the place of the predicted one.
+/// Binds the declared effects in `scope`; measured values replace the predicted ones.
 pub(crate) fn actual(
     declared: Option<&[EffectExpr]>,
     outcome: &str,

@@ -36,14 +36,14 @@ use std::sync::{Arc, OnceLock};
 pub struct Executive {
     program: Arc<Program>,
     plan: Arc<Plan>,
-    /// Of the program and its plan, where a checkpoint was made.
+    /// Fingerprint of the program and its plan, once a checkpoint has needed it.
     fingerprint: OnceLock<[u8; 32]>,
     tolerance: Tolerance,
     root: World,
     last_instance: u64,
     seed: u64,
     signals: Signals,
-    /// Of HSM mode.
+    /// Deadline of the run, in HSM mode.
     deadline: Option<Timestamp>,
     state: State,
 }
@@ -58,7 +58,7 @@ enum State {
 }
 
 impl Executive {
-    /// For one run of a checked program.
+    /// An executive for one run of a checked program.
     pub fn new(program: Arc<Program>, tolerance: Tolerance) -> Executive {
         let plan = Arc::new(Plan::of(&program));
         Executive {
@@ -75,7 +75,7 @@ impl Executive {
         }
     }
 
-    /// Takes an event; what the shell shall do now, in order.
+    /// Handles an event; returns the shell's next commands, in order.
     pub fn handle(&mut self, now: Timestamp, event: Event) -> Vec<Command> {
         let mut commands = Vec::with_capacity(8);
         match event {
@@ -104,7 +104,7 @@ impl Executive {
         matches!(self.state, State::Ended)
     }
 
-    /// How many signals of a name no state has taken yet; more than [`crate::MOST_SIGNALS_KEPT`] are not kept.
+    /// Number of signals of a name that no state has taken yet; at most [`crate::MOST_SIGNALS_KEPT`] are kept.
     pub fn signals_kept(&self, name: &str) -> usize {
         self.signals.count(name)
     }
@@ -119,12 +119,12 @@ impl Executive {
         }
     }
 
-    /// Whether a breakpoint at a path, without visits, ever stops a run of a program: something that may change the environment is there.
+    /// Whether a breakpoint at a path (without visits) can ever stop a run of the program: a PIA is at, inside or around it.
     pub fn stops_for(program: &Program, path: &str) -> bool {
         hold::stops_for(program, path)
     }
 
-    /// Every path at which a breakpoint stops a run of a program, in its order.
+    /// Every path at which a breakpoint stops a run of the program, in program order.
     pub fn stopping(program: &Program) -> Vec<&str> {
         hold::stopping(program)
     }
@@ -135,10 +135,10 @@ impl Executive {
         window.waits(&self.program)
     }
 
-    /// What is wrong between two events, if anything: a broken promise of the executive. For tests; costs the whole window.
+    /// Checks the executive's invariants between two events. For tests; costs the whole window.
     ///
     /// # Errors
-    /// The promise.
+    /// The invariant that does not hold.
     pub fn check_invariants(&self) -> Result<(), String> {
         match &self.state {
             State::Cdtn(window) => window.check_invariants(),
@@ -146,11 +146,11 @@ impl Executive {
         }
     }
 
-    /// Whether anything could go on that was not woken: of a copy, everything that waits is looked at again. For tests; costs the
+    /// Checks that no instance was forgotten that could go on: all waiting instances are examined again in a copy. For tests; costs the
     /// whole window.
     ///
     /// # Errors
-    /// What could have gone on.
+    /// The instance that could have gone on.
     pub fn check_quiescence(&self, now: Timestamp) -> Result<(), String> {
         self.copy().map_err(|error| format!("its checkpoint: {error}"))?.look_at_all(now)
     }
@@ -175,7 +175,7 @@ impl Executive {
         }
     }
 
-    /// What is still to be done, as far as it is certain, for a look ahead ([`crate::lookahead`]); nothing in HSM mode.
+    /// The remaining certain work as a scheduling problem for look-ahead ([`crate::lookahead`]); empty in HSM mode.
     pub fn outlook(&mut self, now: Timestamp) -> Problem {
         let program = self.program.clone();
         let mut commands = Vec::new();
@@ -264,7 +264,7 @@ impl Executive {
             signals: &mut self.signals,
             commands,
         };
-        // An event that comes when the run has been over its deadline comes after that.
+        // The deadline is handled before an event that arrives after it.
         let mut after = None;
         let end = match &mut self.state {
             State::Fresh | State::Ended => None,
@@ -322,7 +322,7 @@ impl Executive {
     }
 }
 
-/// Everything under way ends, and then what is to be done on the way out.
+/// Cancels everything under way; the end returned contains the way out.
 fn cut_short(context: &mut Context<'_>, interpreter: &mut Interpreter, outcome: &str, reason: String) -> End {
     let mut way_out = WayOut::default();
     interpreter.way_out(context.program, &mut way_out);

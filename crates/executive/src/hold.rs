@@ -5,28 +5,28 @@ use ratn_model::program::{Nature, Program, State, StateKind};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
-/// What the operator lets begin.
+/// The operator's control over PIAs.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub(crate) struct Hold {
-    /// So many PIAs, then it is a pause; `None`: all.
+    /// Number of PIAs that may still begin; `None`: no limit.
     steps: Option<u32>,
-    /// The paths of states before which it becomes a pause, as they were said.
+    /// The paths of the breakpoints, as the operator gave them.
     breakpoints: Vec<String>,
-    /// The states that these are, or are inside of.
+    /// The states at the breakpoints and inside of them.
     states: BTreeSet<StateId>,
-    /// The PIA at whose breakpoint it became a pause.
+    /// The PIA whose breakpoint caused the pause.
     stopped_at: Option<InstanceId>,
-    /// The one that was let go from there.
+    /// The PIA that may pass its breakpoint.
     passes: Option<InstanceId>,
 }
 
 impl Hold {
-    /// Whether a PIA of this state may begin.
+    /// Whether a PIA of this state may begin now.
     pub(crate) fn lets_begin(&self, instance: InstanceId, state: StateId) -> bool {
         self.steps != Some(0) && !self.is_at_breakpoint(instance, state)
     }
 
-    /// A PIA that may not begin has its turn. Where that is for a breakpoint, it is a pause from now on.
+    /// Called when a PIA would be next but may not begin: if it stands at a breakpoint, the run pauses from now on.
     pub(crate) fn stops_at(&mut self, instance: InstanceId, state: StateId) -> bool {
         let stops = self.steps != Some(0) && self.is_at_breakpoint(instance, state);
         if stops {
@@ -35,36 +35,36 @@ impl Hold {
         stops
     }
 
-    /// A PIA has begun.
+    /// Notes that a PIA has begun.
     pub(crate) fn has_begun(&mut self, instance: InstanceId) {
         self.steps = self.steps.map(|steps| steps.saturating_sub(1));
         self.passes = self.passes.filter(|passes| *passes != instance);
     }
 
-    /// No more may begin.
+    /// Pauses: no more PIAs begin.
     pub(crate) fn pause(&mut self) {
         self.steps = Some(0);
     }
 
-    /// All may begin.
+    /// Resumes: all PIAs may begin.
     pub(crate) fn resume(&mut self) {
         self.steps = None;
         self.pass();
     }
 
-    /// One more may begin, and then no more.
+    /// Single step: one more PIA may begin, then the run pauses.
     pub(crate) fn step(&mut self) {
         self.steps = Some(self.steps.unwrap_or(0).saturating_add(1));
         self.pass();
     }
 
-    /// These are the breakpoints from now on, by the paths of states without visits.
+    /// Replaces all breakpoints, given by paths of states without visits.
     pub(crate) fn break_at(&mut self, program: &Program, breakpoints: Vec<String>) {
         self.states = breakpoints.iter().flat_map(|path| states_at(program, path)).collect();
         self.breakpoints = breakpoints;
     }
 
-    /// The breakpoints, as they were said.
+    /// The breakpoints, as the operator gave them.
     pub(crate) fn breakpoints(&self) -> &[String] {
         &self.breakpoints
     }
@@ -78,7 +78,7 @@ impl Hold {
     }
 }
 
-/// The states at a path and inside of it; for one inside of a routine that routine, which is one PIA.
+/// The states at a path and inside of it. Inside of a routine: that routine, because it is one PIA.
 fn states_at(program: &Program, path: &str) -> impl Iterator<Item = StateId> {
     let is_in = |inner: &str, outer: &str| inner.strip_prefix(outer).is_some_and(|rest| rest.starts_with('/'));
     let meant = program.states.iter().filter(move |state| {
@@ -87,18 +87,18 @@ fn states_at(program: &Program, path: &str) -> impl Iterator<Item = StateId> {
     meant.map(|state| state.id)
 }
 
-/// Whether a run stops anywhere for a breakpoint at a path: a PIA is there, is inside of it, or is a routine around it.
+/// Whether a breakpoint at a path can stop a run: a PIA is at this path or inside of it, or a routine is around it.
 pub(crate) fn stops_for(program: &Program, path: &str) -> bool {
     states_at(program, path).any(|id| acts(program.state(id)))
 }
 
-/// A state that waits for the operator's leave.
+/// Whether a state needs the operator's permission to begin.
 fn acts(state: &State) -> bool {
     let is_pia = matches!(state.kind, StateKind::Action { .. }) && state.annotations.nature == Nature::Irreversible;
     is_pia || state.is_pause() || state.is_routine()
 }
 
-/// Every path at which a breakpoint stops a run, as [`stops_for`] says of each, in the order of the program.
+/// Every path at which a breakpoint stops a run (see [`stops_for`]), in program order.
 pub(crate) fn stopping(program: &Program) -> Vec<&str> {
     let (mut around, mut routines) = (BTreeSet::new(), BTreeSet::new());
     for state in program.states.iter().filter(|state| acts(state)) {
@@ -114,7 +114,7 @@ pub(crate) fn stopping(program: &Program) -> Vec<&str> {
     paths.filter(|path| !path.is_empty() && stops(path) && told.insert(*path)).collect()
 }
 
-/// The paths around a path.
+/// The paths of the states around a path.
 fn outer(path: &str) -> impl Iterator<Item = &str> {
     path.match_indices('/').map(|(end, _)| &path[..end])
 }

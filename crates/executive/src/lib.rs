@@ -6,9 +6,9 @@
 //!
 //! # What it costs
 //!
-//! `cargo bench -p ratn-executive` prints it: in a full window a goal has ended, or a lease or a projection has come; instances
-//! finish and retire, others begin, and the window grows. Median microseconds per event, one core of a busy machine, the making
-//! of the event and the dropping of the commands included:
+//! Printed by `cargo bench -p ratn-executive`. In a full window a goal has ended, or a lease or a projection has come;
+//! instances finish and retire, others begin, and the window grows. Median microseconds per event on one core of a busy
+//! machine, including the time to make the event and to drop the commands:
 //!
 //! | instances in the window | 10² | 10³ | 10⁴ | 10⁵ | 10⁶ |
 //! |---|---|---|---|---|---|

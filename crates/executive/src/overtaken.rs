@@ -1,12 +1,12 @@
-//! Whether what a run has decided, and has not committed yet, is still true when it comes back without what it held.
+//! Whether a commit that a run has not made yet is still valid after the run lost the leases under which it was decided.
 
 use ratn_model::expression::EffectExpr;
 use ratn_model::expression::scope::NothingKnown;
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::program::Program;
 
-/// Whether somebody else has changed, in this fact, what changes of a state overwrite or are made of. `writer` is its path, with visits. What the state
-/// looks up under an argument that only the run knew is any fact of that predicate.
+/// Whether another writer's change of `key` affects a commit that overwrites this fact or was computed from it. `writer` is the path of the committing
+/// state, with visits. An argument that only the run knew stands for every fact of its predicate.
 #[must_use]
 pub fn was_overtaken(program: &Program, writer: &str, changes: &[Change], key: &FactKey) -> bool {
     let parts = writer.split('/').map(|part| part.split(['[', '#']).next().unwrap_or(part));
@@ -46,7 +46,7 @@ states:
         let overtaken = |name: &str, of| was_overtaken(&program, "part#2/count", &changes, &fact(name, of));
         assert!(overtaken("tools", "rack") && overtaken("boxes", "rack"));
         assert!(!overtaken("cups", "rack") && !overtaken("tools", "deck") && !overtaken("boxes", "deck"));
-        // Which place it is was known to the run alone.
+        // Only the run knew which place it is.
         assert!(was_overtaken(&program, "part#2/each[0]/write", &changes, &fact("boxes", "deck")));
     }
 }

@@ -1,4 +1,4 @@
-//! Events into the executive and commands out of it. Together they are the event log, line by line.
+//! Events into the executive and commands out of it. Together they are the lines of the event log.
 
 use crate::lookahead::Held;
 use ratn_model::fact::{Change, FactKey, Footprint};
@@ -16,7 +16,7 @@ use std::sync::Arc;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mode {
-    /// As written: one state after the other.
+    /// Sequential: as written, one state after the other.
     Hsm,
     /// As a concurrent dataflow task network.
     Cdtn,
@@ -28,66 +28,65 @@ pub struct Learned {
     /// Mean duration of an attempt, in seconds of the robot's time.
     #[serde(default)]
     pub durations_s: BTreeMap<String, f64>,
-    /// How often each outcome (of a condition: `then` and `else`; of a `while`: `again` and `done`) came, as a share of all.
+    /// Share of each outcome, by state. For a condition: `then` and `else`; for a `while`: `again` and `done`.
     #[serde(default)]
     pub outcomes: BTreeMap<String, BTreeMap<String, f64>>,
 }
 
-/// Which run this is, so that task control can go on with it after it was killed.
+/// Identifies a run, so that task control can resume it after a crash.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Origin {
-    /// Its id: the first part of every idempotent id, and the id of its session with the resource manager. Empty where nobody
-    /// can resume it.
+    /// Id of the run: the first part of every idempotent id, and the id of its session with the resource manager. Empty if the run cannot be resumed.
     #[serde(default)]
     pub run: String,
-    /// The number of the session with which it began, as the resource manager numbers sessions: one that is made anew under the same id has
-    /// another. 0 in logs of earlier versions.
+    /// Number that the resource manager gave to the run's first session. A session that is opened again under the same id has another number. 0 in logs
+    /// of earlier versions.
     #[serde(default)]
     pub session: u64,
-    /// The version of the program that runs it.
+    /// Version of the `ratn` binary that executes the run.
     #[serde(default)]
     pub version: String,
     /// The task file, as an absolute path.
     #[serde(default)]
     pub file: String,
-    /// The state of the task's own list at which it began, where that is not the first.
+    /// The state of the task's own list at which the run began, if not the first.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub from: Option<String>,
-    /// The robot that it is for: the name of a built-in one, or the absolute path of its description. Empty in logs of earlier versions.
+    /// The robot: the name of a built-in one, or the absolute path of its description. Empty in logs of earlier versions.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub robot: String,
-    /// When it began, in milliseconds since 1970.
+    /// When the run began, in milliseconds since 1970.
     #[serde(default)]
     pub began_unix_ms: u64,
     /// Paths (without visits) of PIAs beside which younger ones may run: their exceptions are imprecise.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub imprecise: Vec<String>,
-    /// Its share of what several runs need, where that is not the usual one, 1; until it is resumed with another one.
+    /// The run's share of contested resources, if not the default 1. It holds until the run is resumed with another share.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub share: Option<f64>,
-    /// What its states are, so that a log can be read without the task. Nothing in logs of earlier versions.
+    /// Natures of the task's states, so that a log can be read without the task. Empty in logs of earlier versions.
     #[serde(default)]
     pub natures: Natures,
 }
 
-/// What the states of a run are.
+/// The natures of a task's states.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Natures {
     /// Paths (without visits) of the actions that only compute.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub computes: Vec<String>,
-    /// Paths (without visits) of the actions that look at the environment.
+    /// Paths (without visits) of the actions that sense the environment.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub senses: Vec<String>,
     /// The kinds of resources that move the robot.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub actuating: Vec<String>,
-    /// Paths (without visits) of the composite states that change the world when they are left.
+    /// Paths (without visits) of the composite states that change the world at their exit.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub changes_at_exit: Vec<String>,
 }
 
-/// What happened.
+/// An event for the executive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub enum Event {
@@ -97,187 +96,186 @@ pub enum Event {
         task: String,
         /// The task file's digest.
         digest: String,
-        /// How it is executed.
+        /// In which mode the task is executed.
         mode: Mode,
         /// Every parameter's value.
         parameters: BTreeMap<String, Value>,
-        /// What every random choice of this run is derived from.
+        /// Random seed of the run; all its random choices derive from it.
         seed: u64,
         /// The root world at the start.
         world: Vec<(FactKey, Value)>,
         /// The revision of that world.
         revision: Revision,
-        /// How much of each resource kind there are, where that is known: whom a speculative holder keeps waiting follows
-        /// from it.
+        /// Capacity of each resource kind, where it is known. From it follows whom a speculative holder keeps waiting.
         #[serde(default)]
         capacity: BTreeMap<String, Quantity>,
         /// What earlier runs of the task have taught.
         #[serde(default)]
         learned: Learned,
-        /// The breakpoints that it begins with, as in [`Event::BreakpointsSet`].
+        /// The breakpoints at the start of the run, as in [`Event::BreakpointsSet`].
         #[serde(default, skip_serializing_if = "<[String]>::is_empty")]
         breakpoints: Box<[String]>,
-        /// Which run this is.
+        /// Identifies the run.
         #[serde(default)]
         origin: Box<Origin>,
     },
-    /// Task control was gone and goes on from its log. Logged; changes nothing.
+    /// Task control has restarted and resumes the run from its log. Logged; changes nothing.
     Resumed {
-        /// Its share of what several runs need, from now on, where that is another one than before.
+        /// The run's share of contested resources from now on, if it has changed.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         share: Option<f64>,
     },
-    /// What the run has created, deleted and used up is so at the resource manager. Logged; changes nothing.
+    /// The resource manager has recorded what the run created, deleted and consumed. Logged; changes nothing.
     Recorded {
-        /// Up to this one of its [`Command::Operate`]s, which are numbered from 1.
+        /// Number of the last recorded [`Command::Operate`]; they are numbered from 1.
         operation: u64,
-        /// In the session of this number: the run's from now on, where it had another before.
+        /// Number of the session with these records; it is the run's session from now on.
         session: u64,
     },
-    /// The session in which the run had what it held was gone when task control came back. Logged; changes nothing.
+    /// When task control came back, the session under which the run held its resources was gone. Logged; changes nothing.
     SessionLost {
-        /// The world pool's revision of the last commit that the run has made, or at which it began: up to it the run held what it works with. What
-        /// others have changed behind it, they may have changed with the same resources.
+        /// The world pool's revision of the run's last commit, or of its start. Up to this revision the run held its resources; later changes may have
+        /// been made by others with the same resources.
         held_until: Revision,
     },
-    /// The moment of a [`Command::Wake`] has come. Logged, as every event.
+    /// The time of a [`Command::Wake`] has come. Logged, as every event.
     Woken,
-    /// A client sends a signal: the state that waits for one of this name goes on, or the next one that will.
+    /// A client sends a signal. The state that waits for a signal of this name goes on; if none waits, the next one that does.
     Signalled {
         /// Its name.
         signal: String,
-        /// What is sent with it; null where nothing is.
+        /// The value sent with it; null if there is none.
         #[serde(default = "nothing")]
         value: Value,
     },
     /// An operator answers a question.
     Answered {
-        /// Of which instance.
+        /// The instance that asks.
         instance: InstanceId,
-        /// One of its choices.
+        /// One of the question's choices.
         choice: String,
     },
-    /// No PIA shall begin until further notice; what runs goes on, and what only computes or senses begins as ever.
+    /// Pause: no PIA begins until further notice. Running goals go on, and computing and sensing nodes still begin.
     PauseRequested,
-    /// PIAs may begin again.
+    /// Resume: PIAs may begin again.
     ResumeRequested,
-    /// One PIA may begin; then it is a pause again.
+    /// Single step: one PIA may begin, then the run pauses again.
     StepRequested,
-    /// Before a PIA of these states or inside of them begins, it becomes a pause. These are all breakpoints from now on.
+    /// Replaces all breakpoints. The run pauses before a PIA begins that is one of these states or inside of one.
     BreakpointsSet {
         /// The paths of states, without visits.
         states: Vec<String>,
     },
-    /// A look ahead found a better order: how long before the end of everything known each instance should begin.
+    /// Look-ahead found a better order: how long before the end of all known work each instance should begin.
     Advised {
-        /// Seconds, by instance; it stands in for the longest remaining path.
+        /// Seconds, by instance; replaces the longest remaining path.
         urgency_s: Vec<(InstanceId, f64)>,
-        /// Who is held back so that others begin first; whoever was held back and is not in here is not any more.
+        /// Instances that are held back so that others begin first. This list replaces the earlier one.
         #[serde(default)]
         held: Vec<Held>,
     },
-    /// The resource manager granted an [`Command::Acquire`].
+    /// The resource manager granted a [`Command::Acquire`].
     Granted {
-        /// For which instance.
+        /// The instance that asked.
         instance: InstanceId,
-        /// What.
+        /// The lease.
         lease: Lease,
     },
-    /// The resource manager will not grant it.
+    /// The resource manager refused an acquire for good.
     Refused {
-        /// For which instance.
+        /// The instance that asked.
         instance: InstanceId,
-        /// Why, and what to do.
+        /// Why, and what the user can do.
         reason: String,
     },
-    /// The world pool made the projection of a [`Command::Project`], or has promised it under this id where it need not be there first. If nothing comes
-    /// of a promise, `Crashed` follows.
+    /// The world pool made the projection of a [`Command::Project`], or promised it under this id where the goal may start before it exists. If the
+    /// promise is not kept, `Crashed` follows.
     Projected {
-        /// For which instance.
+        /// The instance.
         instance: InstanceId,
-        /// In which attempt.
+        /// Its attempt.
         attempt: u32,
-        /// Its id.
+        /// Id of the projection.
         projection: ProjectionId,
     },
-    /// Somebody else has changed the root world, or facts of it have expired.
+    /// Somebody else has changed the root world, or facts in it have expired.
     WorldChanged {
-        /// The world pool's revision in which they are so.
+        /// The world pool's revision with these changes.
         revision: Revision,
-        /// What holds now of what is otherwise than the run knew; a fact without a value does not.
+        /// The facts that differ from what the run knew, with their present values; without a value: the fact is gone.
         facts: Vec<(FactKey, Option<Value>)>,
     },
-    /// Another run waits for what one of these holds, and needs it for certain. Told again where it waits longer.
+    /// Another run certainly needs a resource that one of these instances holds. Sent again while it keeps waiting.
     WantedByOthers {
-        /// Which instances.
+        /// The holders.
         holders: Vec<InstanceId>,
     },
-    /// A goal says how far it is. Logged; changes nothing.
+    /// Progress of a goal. Logged; changes nothing.
     Progressed {
-        /// Which instance.
+        /// The instance.
         instance: InstanceId,
-        /// In which attempt.
+        /// Its attempt.
         attempt: u32,
-        /// What it says.
+        /// The provider's message.
         message: String,
     },
-    /// A goal has a result that can be used, and goes on for a better one: the first, or a better one than before.
+    /// An anytime goal has its first usable result, or a better one, and goes on improving it.
     Improved {
-        /// Which instance.
+        /// The instance.
         instance: InstanceId,
-        /// In which attempt.
+        /// Its attempt.
         attempt: u32,
         /// Its output ports.
         outputs: BTreeMap<String, Value>,
-        /// What it costs whoever uses it, in seconds of the robot's time: how long the planned motion takes. Each is less than the one
+        /// Cost of the result for its user, in seconds of the robot's time (how long the planned motion takes). Each result costs less than the one
         /// before.
         cost_s: f64,
     },
-    /// A goal has ended and says how.
+    /// A goal has ended with a result from its provider.
     Finished {
-        /// Which instance.
+        /// The instance.
         instance: InstanceId,
-        /// In which attempt.
+        /// Its attempt.
         attempt: u32,
         /// Its outcome.
         outcome: String,
         /// Its output ports.
         outputs: BTreeMap<String, Value>,
-        /// Facts as measured, where the provider measured any that its effects declare.
+        /// Measured facts, if the provider measured facts that the effects declare.
         measured: Vec<(FactKey, Value)>,
-        /// What measured them and how sure that is, as far as it is said.
+        /// What measured them, and with which certainty, as far as the provider says so.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         evidence: Evidence,
-        /// Why, when the outcome is not success; else empty.
+        /// Reason, if the outcome is not success; else empty.
         reason: String,
     },
-    /// The attempt ended without an answer: the worker died, the connection broke, the lease was lost, the world pool failed.
+    /// The attempt ended without an answer: the worker died, the connection broke, the lease was lost, or the world pool failed.
     Crashed {
-        /// Which instance.
+        /// The instance.
         instance: InstanceId,
-        /// In which attempt.
+        /// Its attempt.
         attempt: u32,
-        /// What is known of it.
+        /// What is known about the cause.
         reason: String,
-        /// It may have been done: nobody heard how it ended while task control was gone. What moves is not tried again then.
+        /// Whether the goal may have been performed: task control was down when it ended. A motion is then not tried again.
         #[serde(default, skip_serializing_if = "std::ops::Not::not")]
         unknown: bool,
     },
-    /// The resource manager or world pool did not do what a retirement needs.
+    /// The resource manager or the world pool did not perform an operation or commit of a retirement.
     RetirementFailed {
-        /// Which instance.
+        /// The instance.
         instance: InstanceId,
         /// Why.
         reason: String,
-        /// What of it.
+        /// What was not made.
         #[serde(default, skip_serializing_if = "Unmade::is_unknown")]
         unmade: Unmade,
     },
-    /// The user wants the run to end now. Asked for a second time it ends at once.
+    /// The user asks to end the run now. A second request ends it at once.
     AbortRequested {
         /// Why.
         reason: String,
-        /// Nothing is done any more, not even what states say under `finally`: what it needs cannot be had.
+        /// End at once, without the `finally` blocks: what they need is not available.
         #[serde(default, skip_serializing_if = "std::ops::Not::not")]
         at_once: bool,
     },
@@ -287,113 +285,112 @@ fn nothing() -> Value {
     Value::Null
 }
 
-/// The least priority of an acquire for what is needed whatever is decided; speculative ones ask with less.
+/// The smallest priority of an acquire that is certain, not speculative. Speculative acquires have a smaller one.
 pub const CERTAIN: i64 = 1 << 62;
 
-/// What the shell shall do. Performed in order: commits and projections reach the world pool, acquires and releases the
-/// resource manager, in this order. The
-/// acquires of one event come in the order of their priority and its releases last, so that what is free goes to the most urgent; where something is
-/// deleted or used up, releases come before that.
+/// What the shell performs, in order: commits and projections at the world pool, acquires and releases at the resource manager. The acquires of one
+/// event come in the order of their priority, then its releases, so that free resources go to the most urgent. If something is deleted or consumed,
+/// releases come before that.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "command", rename_all = "snake_case")]
 pub enum Command {
-    /// Nothing to do: a change in an instance's life, for the log.
+    /// A change in an instance's life, for the log only.
     Note(Note),
-    /// Ask the resource manager; answered by `Granted` or `Refused`.
+    /// Ask the resource manager for resources; answered by `Granted` or `Refused`.
     Acquire {
-        /// For which instance.
+        /// The instance.
         instance: InstanceId,
-        /// Blocks, consumes and exists, all or nothing.
+        /// Blocks, consumes and exists; granted all or nothing.
         requirements: Vec<Requirement>,
-        /// Larger first; from [`CERTAIN`] on it is needed whatever is decided.
+        /// Larger first. From [`CERTAIN`] on the node is certain, not speculative.
         priority: i64,
     },
-    /// Withdraw an acquire that was not answered yet (a grant that crosses it is released by the shell).
+    /// Withdraw an acquire that was not answered yet. If a grant crosses the withdrawal, the shell releases it.
     Withdraw {
-        /// Of which instance.
+        /// The instance.
         instance: InstanceId,
     },
-    /// Make a projection: the world at `base` with the changes applied; answered by `Projected` or `Crashed`.
+    /// Make a projection: the world at revision `base` with the changes applied; answered by `Projected` or `Crashed`.
     Project {
-        /// For which instance.
+        /// The instance.
         instance: InstanceId,
-        /// In which attempt.
+        /// Its attempt.
         attempt: u32,
-        /// The root's revision below it.
+        /// The root's revision below the projection.
         base: Revision,
-        /// The effects of the older instances that are not real yet, in program order.
+        /// The effects of the older instances that have not retired, in program order.
         changes: Vec<Change>,
-        /// Who makes the change at the same place, by the path of its instance.
+        /// The writer of each change, at the same index: the path of its instance.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         writers: Vec<Arc<str>>,
-        /// What of it may be seen.
+        /// The facts that the goal may read in it.
         reads: Footprint,
-        /// What holds the room for it: the instance's lease, or that of the routine it is in.
+        /// The lease that covers the room for the projection: the instance's, or that of the routine around it.
         lease: Option<(LeaseId, FencingToken)>,
-        /// Whether it has to be there before the goal begins: what that does changes the environment, or its time is limited.
+        /// Whether the projection must exist before the goal starts, because the goal changes the environment or its time is limited.
         #[serde(default, skip_serializing_if = "std::ops::Not::not")]
         first: bool,
     },
-    /// Give a provider a goal; answered by `Finished` or `Crashed`.
+    /// Give a goal to a provider; answered by `Finished` or `Crashed`.
     Start {
-        /// Which instance.
+        /// The instance.
         instance: InstanceId,
-        /// In which attempt, from 1. (run, instance, attempt) is the goal's idempotent id.
+        /// Its attempt, from 1. (run, instance, attempt) is the goal's idempotent id.
         attempt: u32,
-        /// What to do. Apart, so that commands are small.
+        /// The goal. Boxed, so that commands are small.
         goal: Box<Goal>,
     },
-    /// Stop a goal; its answer, if any, is ignored.
+    /// Cancel a goal; its answer, if any, is ignored.
     Cancel {
-        /// Which instance.
+        /// The instance.
         instance: InstanceId,
-        /// In which attempt.
+        /// Its attempt.
         attempt: u32,
     },
     /// Give back what an instance holds.
     Release {
-        /// Which instance.
+        /// The instance.
         instance: InstanceId,
         /// Its lease, if it has one.
         lease: Option<LeaseId>,
         /// Its projection, if it has one.
         projection: Option<ProjectionId>,
     },
-    /// Make effects real in the root world.
+    /// Commit effects to the root world.
     Commit {
-        /// Whose effects.
+        /// The instance.
         instance: InstanceId,
-        /// The path of that instance, or of the state that is left; of the initial world the task's name.
+        /// Path of the instance, or of the composite state at its exit; for the initial world the task's name.
         #[serde(default)]
         writer: String,
-        /// In order. The root has revision `revision` afterwards.
+        /// The changes, in order. The root has revision `revision` afterwards.
         changes: Vec<Change>,
-        /// What measured which of the facts that are written.
+        /// Evidence for the facts written.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         evidence: Evidence,
-        /// What the root's revision will be.
+        /// The root's revision after the commit.
         revision: Revision,
     },
-    /// Create and delete task resources, and use up what a hierarchy consumes at its exit.
+    /// Create and delete task resources, and consume what a composite state consumes at its exit.
     Operate {
-        /// Whose annotations.
+        /// The instance.
         instance: InstanceId,
         /// Creates, deletes and consumes, in order.
         operations: Vec<Requirement>,
     },
-    /// Send [`Event::Woken`] at this moment or as soon after it as possible.
+    /// Send [`Event::Woken`] at this time or as soon after it as possible.
     Wake {
-        /// When. Named otherwise in a log, whose lines have a time of their own.
+        /// When. It has another name in the log, because log lines have a time of their own.
         #[serde(rename = "when")]
         at: Timestamp,
     },
-    /// The run has ended; everything was released before.
+    /// The run has ended; everything has been released.
     End {
         /// The task's outcome.
         outcome: String,
-        /// The task's outputs, when the outcome is success.
+        /// The task's outputs, if the outcome is success.
         outputs: BTreeMap<String, Value>,
-        /// Why, when it is not; else empty.
+        /// Reason, if the outcome is not success; else empty.
         reason: String,
     },
 }
@@ -402,7 +399,7 @@ pub enum Command {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "note", rename_all = "snake_case")]
 pub enum Note {
-    /// It is in the window now.
+    /// The instance was expanded into the window.
     Expanded {
         /// Its id.
         instance: InstanceId,
@@ -413,83 +410,83 @@ pub enum Note {
         /// Whether a condition on its path is undecided.
         speculative: bool,
     },
-    /// A condition or a loop's collection is decided.
+    /// A condition or a loop's list is decided.
     Decided {
         /// Its id.
         instance: InstanceId,
         /// Its path.
         path: String,
-        /// What it came to: `then`, `else`, or the number of elements.
+        /// The decision: `then`, `else`, or the number of elements.
         decision: String,
     },
-    /// It would begin and stands at a breakpoint: no PIA begins until the operator lets it go.
+    /// The instance would begin, but stands at a breakpoint: no PIA begins until the operator lets it go.
     Stopped {
         /// Its id.
         instance: InstanceId,
     },
-    /// It has its resources and, where it needs one, its projection: its goal starts.
+    /// The instance has its resources and, if needed, its projection: its goal starts.
     Running {
         /// Its id.
         instance: InstanceId,
         /// In which attempt.
         attempt: u32,
     },
-    /// It waits, and what it waits for is not there yet.
+    /// The instance waits, and what it waits for has not come yet.
     Awaiting {
         /// Its id.
         instance: InstanceId,
         /// What it waits for.
         #[serde(flatten)]
         awaited: Awaited,
-        /// Until then at the most.
+        /// Latest end of the wait.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         until: Option<Timestamp>,
     },
-    /// Its result is known.
+    /// The result is known.
     Finished {
         /// Its id.
         instance: InstanceId,
         /// Its outcome.
         outcome: Arc<str>,
     },
-    /// Its result is real.
+    /// The result is real.
     Retired {
         /// Its id.
         instance: InstanceId,
     },
-    /// It was part of a routine that works on a projection, and has ended: what it came to is the routine's, and no more is said of it.
+    /// A part of a routine on a projection has ended. Its result belongs to the routine; nothing more is logged of it.
     Merged {
         /// Its id.
         instance: InstanceId,
     },
-    /// Its result, or what it is at, was made of something that came out otherwise: it is computed again.
+    /// The instance's result, or its running attempt, depends on something that came out otherwise: it is computed again.
     Invalidated {
         /// Its id.
         instance: InstanceId,
         /// What came out otherwise.
         reason: String,
     },
-    /// It holds what another needs for which it is certain that it is needed: it gives it back and begins again later.
+    /// The instance gives back its resources and begins again later, because a certain (not speculative) instance needs them.
     Preempted {
         /// Its id.
         instance: InstanceId,
-        /// Who needs it; `None`: another run.
+        /// The instance that needs them; `None`: another run.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         by: Option<InstanceId>,
     },
-    /// The same was computed before, from the same inputs and facts and with the same seed: that result is its result.
+    /// The result cache had the result of the same computation (same inputs, facts and seed): the instance takes it over.
     Reused {
         /// Its id.
         instance: InstanceId,
     },
-    /// It is discarded: its branch is not taken, or the task ended before it.
+    /// The instance is discarded: its branch is not taken, or the task ended before it.
     Squashed {
         /// Its id.
         instance: InstanceId,
     },
 }
 
-/// What a state waits for in which the executive waits itself.
+/// What a state waits for when the executive itself waits, without a provider.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "awaits", rename_all = "snake_case")]
 pub enum Awaited {
@@ -497,21 +494,21 @@ pub enum Awaited {
     Time,
     /// A condition on the actual world.
     Condition {
-        /// As it is written.
+        /// The condition as written.
         condition: String,
     },
-    /// [`Event::Signalled`].
+    /// A signal: [`Event::Signalled`].
     Signal {
         /// The signal's name.
         signal: String,
     },
-    /// [`Event::Answered`].
+    /// An answer: [`Event::Answered`].
     Answer {
-        /// What is asked.
+        /// The question.
         question: String,
-        /// What may be answered.
+        /// The possible answers.
         choices: Vec<String>,
-        /// The answer when nobody answers in time.
+        /// The answer if nobody answers in time.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         default: Option<String>,
     },
@@ -528,16 +525,16 @@ impl fmt::Display for Awaited {
     }
 }
 
-/// What was not made of what an instance had decided.
+/// Which part of an instance's commit and operations was not made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Unmade {
-    /// Logs of earlier versions do not say.
+    /// Not recorded in logs of earlier versions.
     #[default]
     Unknown,
-    /// Nothing of it was refused for good: a commit that may still be made, or what was not tried because something before it had failed.
+    /// Nothing was refused for good: the commit may still be made, or the operation was not tried because an earlier one failed.
     Untried,
-    /// The operation of this number was tried.
+    /// The operation of this number was tried and failed.
     Operation(u64),
 }
 
@@ -558,21 +555,21 @@ pub struct Goal {
     pub action: Arc<str>,
     /// Its input ports.
     pub inputs: BTreeMap<String, Value>,
-    /// What the action's random choices are derived from.
+    /// Random seed for the action.
     pub seed: u64,
-    /// What it may use; the provider is the resource of its kind in it.
+    /// The lease for its resources; the provider is the resource of its own kind in it.
     pub lease: Option<Lease>,
-    /// The world it works on; `None` for a node that reads no world model.
+    /// The projection it works on; `None` for a node that reads no world model.
     pub projection: Option<ProjectionId>,
-    /// How long it is expected to take, in seconds of the robot's time, where the task says so.
+    /// Expected duration, in seconds of the robot's time, if the task declares it.
     pub expected_s: Option<f64>,
-    /// It is cancelled when it takes longer than this, in seconds of the robot's time.
+    /// Timeout in seconds of the robot's time: the goal is cancelled after it.
     #[serde(default)]
     pub timeout_s: Option<f64>,
-    /// Where it may go on when it has a result, and improve it until it is told to stop: the outputs that stay as they were at first.
+    /// For an anytime action, which may improve its first result until it is cancelled: the outputs that must not change then.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub improves: Option<Box<[String]>>,
-    /// Its state reads no facts, so that it need not wait for what was decided before it. False in logs of earlier versions.
+    /// The state reads no facts, so the goal need not wait until earlier commits are confirmed. False in logs of earlier versions.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub reads_nothing: bool,
 }
@@ -582,12 +579,12 @@ pub struct Goal {
 pub struct LogLine {
     /// When, in the robot's time since the start of the run.
     pub at: Timestamp,
-    /// What.
+    /// The event or command.
     #[serde(flatten)]
     pub entry: LogEntry,
 }
 
-/// What happened, or what was decided then.
+/// An event, or a command that was decided for it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum LogEntry {

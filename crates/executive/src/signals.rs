@@ -1,13 +1,13 @@
 //! Signals that were sent to the run and that no wait has taken yet.
 //!
-//! Each signal ends one wait, the oldest signal of a name first. One that comes before its wait is kept for it. Only a wait at its
-//! place in the program takes one: nothing speculative does, so none is lost with a branch that is not taken.
+//! Each signal ends one wait, the oldest signal of a name first; one that arrives before its wait is kept. Only a wait at its place in
+//! the program takes a signal, never a speculative instance, so none is lost with a branch that is not taken.
 
 use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 
-/// More signals of one name than this are not kept for waits to come.
+/// Limit of kept signals per name.
 pub const MOST_SIGNALS_KEPT: usize = 1024;
 
 /// What was sent, by name.
@@ -17,8 +17,8 @@ pub(crate) struct Signals {
 }
 
 impl Signals {
-    /// A signal has come. Where too many of its name are kept it is dropped: task control refuses those before they are events. A name
-    /// that somebody waits for has none that are kept, so what is waited for is never refused.
+    /// Keeps a signal for a later wait. Above the limit it is dropped; task control refuses such signals before they become events.
+    /// While a wait for a name is under way, none of its signals are kept, so a signal that is waited for is never refused.
     pub(crate) fn came(&mut self, name: String, value: Value) {
         let of_name = self.kept.entry(name).or_default();
         if of_name.len() < MOST_SIGNALS_KEPT {
@@ -26,7 +26,7 @@ impl Signals {
         }
     }
 
-    /// A wait takes the oldest of a name.
+    /// Takes the oldest kept signal of a name for a wait.
     pub(crate) fn take(&mut self, name: &str) -> Option<Value> {
         let of_name = self.kept.get_mut(name)?;
         let value = of_name.pop_front();
@@ -36,7 +36,7 @@ impl Signals {
         value
     }
 
-    /// How many of a name are kept.
+    /// Number of kept signals of a name.
     pub(crate) fn count(&self, name: &str) -> usize {
         self.kept.get(name).map_or(0, VecDeque::len)
     }

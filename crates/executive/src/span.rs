@@ -1,8 +1,8 @@
-//! Spans of the robot's time, from seconds.
+//! Durations of the robot's time, from seconds.
 
 use std::time::Duration;
 
-/// So many seconds. Less than nothing, and what is no number, is nothing; more than can be counted is for ever.
+/// A duration of `seconds`. Negative values and NaN give zero; values beyond the range give the longest duration.
 pub(crate) fn span(seconds: f64) -> Duration {
     Duration::try_from_secs_f64(seconds.max(0.0)).unwrap_or(Duration::MAX)
 }

@@ -1,15 +1,15 @@
-//! What is still to be done when a run is cut short: told to end, or over its deadline.
+//! The way out of a run that is aborted or over its deadline: its remaining `finally` blocks.
 //!
-//! The states with something to do on every way out (`finally`) that are entered and not left are left one after the other, the innermost
-//! first: what they contain says what being cut short did to the world (`effects: {preempted: […]}`), then their `finally` is executed, by the
-//! sequential interpreter on the actual world, in both modes. One that was under way already is begun anew. Then the run ends.
+//! The entered states that have a `finally` are left one after the other, the innermost first. First the states inside declare how being cut
+//! short changed the world (`effects: {preempted: […]}`), then the `finally` block is executed, by the sequential interpreter on the actual
+//! world, in both modes. A `finally` that was already under way is begun again. Then the run ends.
 //!
 //! ```text
 //! told to end ─► what is under way is cancelled ─► each `finally`, the innermost first ─► the end
 //!                                                     └─ told again, or after 60 s: cancelled ─┘
 //! ```
 //!
-//! Outcome and reason are those of the first time; a `finally` that fails is told in the reason, and keeps no other one from being done.
+//! Outcome and reason are those of the first request. A `finally` that fails is added to the reason; the others are still executed.
 
 use crate::binding::{Outputs, child_path};
 use crate::context::Context;
@@ -25,7 +25,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-/// A run that was told to end has ended after so many of the robot's seconds, whatever it does on its way out.
+/// Limit of the way out, in seconds of the robot's time: then the run ends, whatever is under way.
 const LIMIT_S: u64 = 60;
 
 /// The states to be left.
@@ -33,14 +33,14 @@ const LIMIT_S: u64 = 60;
 pub(crate) struct WayOut {
     scopes: Vec<Scope>,
     steps: Vec<Step>,
-    /// What the operator lets begin.
+    /// The operator's pause and breakpoints.
     pub(crate) hold: Hold,
 }
 
-/// A state that is entered and not left: its path, and how often what it does when it is cut short was begun.
+/// A state that is entered and not left: its path, and how often its `finally` was begun.
 pub(crate) type Place = (StateId, String, u32);
 
-/// What the thread of control of a routine is in, the innermost first, and what is seen there.
+/// The states that a routine's thread is in, the innermost first, with the variables and outputs in scope.
 #[derive(Default)]
 pub(crate) struct Within {
     pub(crate) places: Vec<Place>,
@@ -48,7 +48,7 @@ pub(crate) struct Within {
     pub(crate) outputs: BTreeMap<StateId, Outputs>,
 }
 
-/// What is seen from where a thread of control was.
+/// The scope at the place of a thread of control.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Scope {
     variables: Vec<(String, Value)>,
@@ -58,16 +58,16 @@ struct Scope {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Step {
     scope: usize,
-    /// What is left, or what is done when the state around it is left.
+    /// The state to leave, or the `finally` state to execute.
     state: StateId,
     path: String,
     is_finally: bool,
-    /// How deep in the program.
+    /// Depth in the tree of states.
     depth: usize,
 }
 
 impl WayOut {
-    /// The states in which a thread of control is, the innermost first.
+    /// Adds the states that a thread of control is in, the innermost first.
     pub(crate) fn add(
         &mut self,
         program: &Program,
@@ -99,7 +99,7 @@ impl WayOut {
         }
     }
 
-    /// Whether nothing is to be done.
+    /// Whether there is nothing to do.
     pub(crate) fn is_empty(&self) -> bool {
         self.steps.is_empty()
     }
@@ -109,21 +109,21 @@ impl WayOut {
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Leaving {
     end: End,
-    /// The last is next.
+    /// Remaining steps, the next one last.
     steps: Vec<Step>,
     scopes: Vec<Scope>,
     hold: Hold,
-    /// What is being done, and in which scope.
+    /// The present `finally`, with the index of its scope.
     current: Option<(usize, Box<Interpreter>)>,
     until: Timestamp,
-    /// When the last event was.
+    /// Time of the last event.
     last: Timestamp,
-    /// The user has asked for the end: when he does so again, it comes at once.
+    /// The user has asked to end the run; a second request ends it at once.
     is_asked: bool,
 }
 
 impl Leaving {
-    /// Begins; the end, if nothing is to be waited for.
+    /// Begins the way out; returns the run's end if there is nothing to wait for.
     pub(crate) fn begin(context: &mut Context<'_>, mut end: End) -> Result<Leaving, Box<End>> {
         let WayOut { scopes, mut steps, hold } = std::mem::take(&mut end.way_out);
         steps.sort_by_key(|step| (step.depth, std::cmp::Reverse(step.state)));
@@ -139,16 +139,16 @@ impl Leaving {
         }
     }
 
-    /// Takes an event; the end of the run, when this was it.
+    /// Handles an event; returns the end of the run if this event ended it.
     pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Option<End> {
         let before = std::mem::replace(&mut self.last, context.now);
         match event {
-            // The time in which nobody was there is not its own.
+            // Time while task control was down does not count against the limit.
             Event::Resumed { .. } => {
                 self.until = self.until + context.now.since(before);
                 context.commands.push(Command::Wake { at: self.until });
             }
-            // The run is over its deadline, and the user asks for the first time.
+            // First request by the user of a run that is over its deadline.
             Event::AbortRequested { at_once: false, .. } if !self.is_asked => self.is_asked = true,
             Event::AbortRequested { reason, .. } => return self.cut_short(context, &reason),
             Event::RetirementFailed { reason, .. } => {
@@ -167,12 +167,12 @@ impl Leaving {
         self.go_on(context)
     }
 
-    /// As [`crate::executive::Executive::breakpoints`].
+    /// The breakpoints; see [`crate::executive::Executive::breakpoints`].
     pub(crate) fn breakpoints(&self) -> &[String] {
         self.current.as_ref().map_or(self.hold.breakpoints(), |(_, interpreter)| interpreter.breakpoints())
     }
 
-    /// Does what is next until something is to be waited for.
+    /// Executes the next steps until there is something to wait for.
     fn go_on(&mut self, context: &mut Context<'_>) -> Option<End> {
         while self.current.is_none() {
             let Some(Step { scope, state, path, is_finally, .. }) = self.steps.pop() else {
@@ -191,7 +191,7 @@ impl Leaving {
         None
     }
 
-    /// What was being done has ended, if it has; what it assigned is seen by what is done next.
+    /// Ends the current step if it has finished; later steps see the variables that it assigned.
     fn ended(&mut self, progress: Progress) {
         let Progress::Ended { outcome, reason } = progress else { return };
         let Some((scope, interpreter)) = self.current.take() else { return };
@@ -205,7 +205,7 @@ impl Leaving {
         }
     }
 
-    /// It ends at once.
+    /// Ends the run at once.
     fn cut_short(&mut self, context: &mut Context<'_>, why: &str) -> Option<End> {
         if let Some((_, mut interpreter)) = self.current.take() {
             interpreter.abort(context);

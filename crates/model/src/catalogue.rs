@@ -1,6 +1,6 @@
-//! What a system offers to tasks: its providers of actions and its resources. Read from the system's config, so that a
-//! task can be checked before anything is started. Where a system runs, what its workers say of
-//! themselves ([`WorkerDescription`]) extends it, or is compared with it.
+//! The catalogue: the providers of actions and the resources that a system offers to tasks. Read from the system's config, so
+//! that a task can be checked before anything is started. When a system runs, descriptions by its workers ([`WorkerDescription`])
+//! extend the catalogue or are compared with it.
 
 mod annotations;
 mod description;
@@ -30,7 +30,7 @@ pub struct Catalogue {
 /// The catalogue of the bundled system, as text.
 const STANDARD: &str = include_str!("../../../deploy/catalogue.toml");
 
-/// A text that is no catalogue.
+/// Error: the text is no catalogue.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("not a catalogue: {0}")]
 pub struct InvalidCatalogue(String);
@@ -39,17 +39,18 @@ impl Catalogue {
     /// Reads the TOML form, as in `deploy/catalogue.toml`.
     ///
     /// # Errors
-    /// [`InvalidCatalogue`] with line and column of the first thing that does not fit, or with the annotation that does not read.
+    /// [`InvalidCatalogue`] with line and column of the first thing that does not fit, or with the first annotation that cannot
+    /// be parsed.
     pub fn from_toml(text: &str) -> Result<Catalogue, InvalidCatalogue> {
         let catalogue: Catalogue =
             toml::from_str(text).map_err(|error| InvalidCatalogue(error.to_string().trim_end().to_owned()))?;
         catalogue.check().map(|()| catalogue)
     }
 
-    /// Whether all that it says of actions reads.
+    /// Checks that all annotations of actions can be parsed.
     ///
     /// # Errors
-    /// [`InvalidCatalogue`] with the first annotation that does not.
+    /// [`InvalidCatalogue`] with the first annotation that cannot be parsed.
     pub fn check(&self) -> Result<(), InvalidCatalogue> {
         for (name, provider) in &self.providers {
             for (action, signature) in &provider.actions {
@@ -89,12 +90,12 @@ impl Catalogue {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Provider {
-    /// The kind of resource that performs the actions; a state that uses one must block it.
+    /// The kind of resource that performs the actions; a state that uses an action must block one.
     pub resource: String,
-    /// How many joint positions its inputs of type `joints` have; `None` is any number.
+    /// Number of joint positions in its inputs of type `joints`; `None` allows any number.
     #[serde(default)]
     pub joints: Option<u32>,
-    /// Whose joints these are, for messages; known where the robot is.
+    /// The names of these joints, for messages; known if the robot is known.
     #[serde(skip)]
     pub chain: Option<JointChain>,
     /// By action name, the part after the slash.
@@ -105,15 +106,15 @@ pub struct Provider {
 /// The joints that a provider moves.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct JointChain {
-    /// What the robot is called.
+    /// The robot's name.
     pub robot: String,
-    /// What its arm is called.
+    /// The arm's name.
     pub arm: String,
-    /// From the foot to the tool.
+    /// Joint names from the base to the tool.
     pub joints: Vec<String>,
 }
 
-/// The ports of an action, and what else a task has to know of it.
+/// The ports of an action, and everything else that a task has to know about it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ActionSignature {
@@ -129,13 +130,13 @@ pub struct ActionSignature {
     /// Outcomes besides `success`, `aborted` and `preempted`.
     #[serde(default)]
     pub outcomes: Vec<String>,
-    /// What it does, for people.
+    /// Description, for people.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub description: String,
-    /// What optional inputs are where they are not given, as people write it. For people: the provider fills them in.
+    /// Defaults of optional inputs, as people write them. For people: the provider fills them in.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub defaults: BTreeMap<String, String>,
-    /// What is true of every state that performs it and says nothing else itself.
+    /// Annotations of every state that performs the action and does not say otherwise.
     #[serde(default, skip_serializing_if = "Annotations::is_empty")]
     pub annotations: Annotations,
 }
@@ -146,21 +147,21 @@ pub struct ActionSignature {
 pub struct ResourceOffer {
     /// Its class.
     pub class: ResourceClass,
-    /// How many there can be at the most, or how much in all.
+    /// Largest number of units, or total amount.
     pub count: Quantity,
-    /// Parts of a unit can be had (battery charge).
+    /// Whether fractions of a unit can be acquired (battery charge).
     #[serde(default)]
     pub divisible: bool,
-    /// What a task consumed returns when the task ends; so it does unless it says otherwise.
+    /// Whether a consumed amount returns when the task ends; true by default.
     #[serde(default = "renewable")]
     pub renewable: bool,
-    /// Blocking it can change the environment: a state that computes or senses may not.
+    /// Whether blocking it can change the environment; a state that computes or senses may not block it.
     #[serde(default)]
     pub actuates: bool,
 }
 
 impl ResourceOffer {
-    /// So much of something countable that does not act.
+    /// An indivisible, renewable offer of `count` that does not actuate.
     pub fn new(class: ResourceClass, count: impl Into<Quantity>) -> ResourceOffer {
         ResourceOffer { class, count: count.into(), divisible: false, renewable: true, actuates: false }
     }

@@ -1,7 +1,7 @@
 //! The rules of `ratn check`, over a program whose names are resolved and the catalogue of a system.
 //!
-//! One file per family of rules. A rule finds everything that breaks it and says where, what and what to do; loading has
-//! found before whatever does not read at all ([`crate::load`]).
+//! One file per family of rules. A rule reports every violation: where it is, what is wrong and what to do. Whatever
+//! cannot be parsed has been reported by loading before ([`crate::load`]).
 //!
 //! | file | rules |
 //! |---|---|
@@ -40,28 +40,28 @@ use crate::value::Value;
 use graph::ControlFlow;
 use std::collections::BTreeMap;
 
-/// What a rule sees.
+/// The input of every rule.
 pub(crate) struct Subject<'a> {
     pub(crate) program: &'a Program,
     pub(crate) catalogue: &'a Catalogue,
-    /// The task says what holds at the start.
+    /// Whether the task declares its initial world.
     pub(crate) declares_world: bool,
-    /// Whether a run of it begins at another state than the first: what nothing leads to then is no mistake.
+    /// Whether the run begins at another state than the first; then unreachable states are no mistake.
     pub(crate) begins_elsewhere: bool,
     pub(crate) places: &'a Places,
-    /// The functions of the file: name, how it is called, with how many arguments.
+    /// The functions of the file: name, usage, number of arguments.
     pub(crate) functions: &'a [(String, String, usize)],
     pub(crate) control: &'a ControlFlow,
 }
 
-/// What of a file is not in its program.
+/// What the rules need besides the program.
 pub(crate) struct Said<'a> {
-    /// The task says what holds at the start.
+    /// Whether the task declares its initial world.
     pub(crate) declares_world: bool,
-    /// Whether a run of it begins at another state than the first: what nothing leads to then is no mistake.
+    /// Whether the run begins at another state than the first; then unreachable states are no mistake.
     pub(crate) begins_elsewhere: bool,
     pub(crate) places: &'a Places,
-    /// As in [`Subject`].
+    /// The functions of the file.
     pub(crate) functions: &'a [(String, String, usize)],
 }
 
@@ -83,12 +83,10 @@ pub(crate) fn check(program: &Program, catalogue: &Catalogue, said: &Said<'_>, f
 }
 
 impl<'a> Subject<'a> {
-    /// Where a part of a state stands in the file.
     pub(crate) fn place(&self, state: &State, part: &str) -> Location {
         self.places.of(state.id, part, state.location)
     }
 
-    /// Where an expression of a state stands in the file.
     pub(crate) fn place_of(&self, state: &State, slot: Slot<'_>) -> Location {
         self.place(state, &slot.to_string())
     }
@@ -100,7 +98,7 @@ impl<'a> Subject<'a> {
     }
 }
 
-/// Every expression of a state that is evaluated somewhere: what regions share is only compared.
+/// Every expression of a state that is evaluated at run time. Facts that regions share (`shared`) are only compared.
 pub(crate) fn expressions<'a>(program: &'a Program, state: &'a State) -> Vec<(Slot<'a>, &'a Expr)> {
     let mut all = program.expressions(state);
     all.retain(|(slot, _)| *slot != Slot::Shared);
@@ -114,7 +112,7 @@ pub(crate) fn named(program: &Program, expr: &Expr) -> String {
     named.to_string()
 }
 
-/// An output of a state becomes what is displayed as the output of a state of its name.
+/// Replaces a state's id by its name in an output, for display.
 pub(crate) fn name_state(program: &Program, part: &mut Expr) {
     if let Expr::Port { state, port } = part {
         let name = Expr::Literal(Value::String(program.state(*state).name.clone()));
@@ -133,5 +131,5 @@ pub(crate) fn branches(state: &State) -> [&[StateId]; 2] {
     }
 }
 
-/// The types of the variables that a state sees.
+/// The types of the variables in scope in a state.
 pub(crate) type Variables = BTreeMap<String, crate::value::Type>;

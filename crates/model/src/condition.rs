@@ -1,7 +1,7 @@
-//! What a resource's attributes have to be like to be chosen: `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`.
+//! Conditions on the attributes of a resource: `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`.
 //!
-//! Comparisons mean what they mean in expressions. An attribute that a resource does not have meets no condition, not even `!=`; nor
-//! does one that cannot be compared. `host` is the host that a resource is on, unless it has an attribute of that name.
+//! Comparisons have the same meaning as in expressions. A missing attribute satisfies no condition, not even `!=`; nor does an
+//! attribute that cannot be compared. `host` is the host of the resource, unless the resource has an attribute of that name.
 
 use crate::expression::evaluate::compare;
 use crate::expression::parse::parse_expression;
@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// How an attribute is looked at.
+/// The comparison of an attribute.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Comparison {
@@ -31,18 +31,18 @@ pub enum Comparison {
     GreaterOrEqual,
     /// `in` a list.
     In,
-    /// `has`: it is there, whatever its value.
+    /// `has`: the attribute exists, whatever its value.
     Has,
 }
 
-/// What one attribute has to be like.
+/// A condition on one attribute.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Condition {
-    /// Its name.
+    /// The attribute's name.
     pub attribute: String,
-    /// How it is looked at.
+    /// The comparison.
     pub comparison: Comparison,
-    /// With what it is compared; null for [`Comparison::Has`], a list for [`Comparison::In`].
+    /// The value to compare with; null for [`Comparison::Has`], a list for [`Comparison::In`].
     pub value: Value,
 }
 
@@ -51,14 +51,14 @@ pub struct Condition {
 pub struct ConditionExpr {
     /// The attribute's name.
     pub attribute: String,
-    /// How it is looked at.
+    /// The comparison.
     pub comparison: Comparison,
-    /// With what it is compared; null for [`Comparison::Has`].
+    /// The value to compare with; null for [`Comparison::Has`].
     pub value: Expr,
 }
 
 impl Comparison {
-    /// All of them with their words, as they are written.
+    /// All comparisons, each with its symbol or word.
     pub const WRITTEN: [(&'static str, Comparison); 8] = [
         ("=", Comparison::Equal),
         ("!=", Comparison::NotEqual),
@@ -70,7 +70,7 @@ impl Comparison {
         ("has", Comparison::Has),
     ];
 
-    /// That of an operator of expressions, where it is one.
+    /// The comparison of an operator of expressions, if it is one.
     pub fn of(operator: BinaryOperator) -> Option<Comparison> {
         Comparison::WRITTEN.map(|(_, comparison)| comparison).into_iter().find(|c| c.operator() == Some(operator))
     }
@@ -90,12 +90,12 @@ impl Comparison {
 }
 
 impl Condition {
-    /// That an attribute is there.
+    /// The condition that an attribute exists.
     pub fn has(attribute: impl Into<String>) -> Condition {
         Condition { attribute: attribute.into(), comparison: Comparison::Has, value: Value::Null }
     }
 
-    /// Whether an attribute of this value meets it.
+    /// Whether an attribute with this value satisfies the condition.
     pub fn holds(&self, have: &Value) -> bool {
         match self.comparison.operator() {
             None => true,
@@ -104,13 +104,13 @@ impl Condition {
     }
 }
 
-/// A text that is no condition.
+/// Error: the text is no condition.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{text}` is no condition on an attribute: {problem}; write {}", ConditionExpr::WRITTEN)]
 pub struct InvalidCondition {
-    /// As it was written.
+    /// The text.
     pub text: String,
-    /// What does not fit, and where.
+    /// What is wrong, and where.
     pub problem: String,
 }
 
@@ -134,11 +134,11 @@ impl FromStr for Condition {
 }
 
 impl ConditionExpr {
-    /// How conditions are written.
+    /// How to write a condition, for messages.
     pub(crate) const WRITTEN: &str =
         "one attribute and what it must be like: `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`";
 
-    /// `has camera`, where it is that.
+    /// Parses `has camera`, if it is that.
     pub(crate) fn presence(text: &str) -> Option<ConditionExpr> {
         let is_name =
             |name: &&str| !name.is_empty() && name.chars().all(|c| c.is_alphanumeric() || c == '_' || c == '-');
@@ -146,7 +146,7 @@ impl ConditionExpr {
         Some(ConditionExpr { attribute, comparison: Comparison::Has, value: Expr::Literal(Value::Null) })
     }
 
-    /// `payload >= 2.5`, where an expression is that.
+    /// An expression like `payload >= 2.5` as a condition.
     pub(crate) fn comparison(expression: Expr) -> Option<ConditionExpr> {
         let Expr::Binary(operator, left, right) = expression else { return None };
         let Expr::Literal(Value::String(attribute)) = *left else { return None };
@@ -156,7 +156,7 @@ impl ConditionExpr {
     /// The condition with its value evaluated.
     ///
     /// # Errors
-    /// As [`Expr::evaluate`]; also for an `in` of what is no list.
+    /// As [`Expr::evaluate`]; also if the operand of `in` is no list.
     pub fn bind(&self, scope: &dyn Scope) -> Result<Condition, EvaluateError> {
         let value = self.value.evaluate(scope)?;
         if self.comparison == Comparison::In && !matches!(value, Value::List(_)) {

@@ -4,7 +4,7 @@ use crate::program::Location;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// At most this many are collected before loading gives up.
+/// Limit of collected findings; then loading stops.
 pub const MAX_DIAGNOSTICS: usize = 100;
 
 /// A finding of `check`.
@@ -24,7 +24,7 @@ pub struct Diagnostic {
     pub path: String,
     /// What is wrong.
     pub message: String,
-    /// What to do; empty where the message says it.
+    /// What to do; empty if the message already tells.
     pub help: String,
 }
 
@@ -92,7 +92,7 @@ impl Findings {
     }
 
     fn add(&mut self, severity: Severity, rule: &str, location: Location, path: &str, message: String, help: String) {
-        // What stands once in the file may be several states of the program: it is told once.
+        // One line of the file may stand for several states of the program; a finding in it is reported once.
         let is_known = |d: &Diagnostic| {
             (d.location, d.severity, d.rule.as_str(), d.message.as_str()) == (location, severity, rule, &message)
         };

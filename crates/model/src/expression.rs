@@ -5,12 +5,12 @@
 //!
 //! - [`scope`]: where names get their values
 //! - [`evaluate`]: expression → value; [`function`] holds the built-ins
-//! - [`comprehension`]: `filter`, `map`, `sort_by` and others, which ask something of every element of a list
-//! - [`bind`]: facts, effects and resources with their arguments evaluated; which facts an effect may write
+//! - [`comprehension`]: `filter`, `map`, `sort_by` and others, which evaluate an expression for every element of a list
+//! - [`bind`]: evaluates the arguments of facts, effects and resources; finds the facts that an effect may write
 //! - [`parse`]: text → expression
 //! - [`query`]: conditions over facts, with variables
-//! - [`walk`]: what an expression mentions
-//! - [`display`]: back to text, for messages
+//! - [`walk`]: the names that an expression mentions
+//! - [`display`]: expression → text, for messages
 
 pub mod bind;
 pub mod comprehension;
@@ -35,15 +35,15 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Expr {
-    /// A constant. A bare word is the individual of that name: a string.
+    /// A constant. A bare word is a string: the name of an individual.
     Literal(Value),
     /// `$name`: a loop variable or a task parameter.
     Variable(String),
     /// A bare word that names an output of the state itself (only in its effects).
     Output(String),
-    /// `state.port`: an output of another state, of its latest visit before this one in program order.
+    /// `state.port`: an output of another state, of its latest visit before this place in program order.
     Port {
-        /// The state that writes it.
+        /// The state that writes the output.
         state: StateId,
         /// Its output port.
         port: String,
@@ -58,15 +58,15 @@ pub enum Expr {
     Map(Vec<(String, Expr)>),
     /// A built-in pure function.
     Call(Function, Vec<Expr>),
-    /// `filter($x in list, …)`: something about every element of a list.
+    /// `filter($x in list, …)`: a comprehension over every element of a list.
     Each {
-        /// What is made of the list.
+        /// What the comprehension returns.
         what: Comprehension,
         /// The name of the element in the body, without `$`.
         element: String,
         /// The list.
         list: Box<Expr>,
-        /// What is evaluated for every element.
+        /// The expression that is evaluated for every element.
         body: Box<Expr>,
     },
     /// `$name` in the body of a comprehension: the element.
@@ -77,10 +77,10 @@ pub enum Expr {
     Exists(FactExpr),
     /// `exists (condition, …)`: whether the query has an answer.
     Query(Vec<Expr>),
-    /// `find(?name, …, condition, …)`: the values that answers to the query give to the variables, each once and the least first; of several
+    /// `find(?name, …, condition, …)`: the values of the variables in all answers to the query, sorted and without duplicates; with several
     /// variables records with a field for each.
     Find(Vec<String>, Vec<Expr>),
-    /// `?name`: a variable of the query around.
+    /// `?name`: a variable of the query around it.
     Unknown(String),
     /// `not a`, `-a`
     Unary(UnaryOperator, Box<Expr>),
@@ -113,7 +113,7 @@ pub enum EffectExpr {
         variable: String,
         /// The list.
         collection: Expr,
-        /// What holds of every element.
+        /// The effects for every element.
         effects: Vec<EffectExpr>,
     },
 }
@@ -134,14 +134,14 @@ pub enum Function {
     Abs,
     /// `sqrt(x)`
     Sqrt,
-    /// `floor(x)` → the greatest int that is not greater
+    /// `floor(x)` → the greatest int that is not greater than x
     Floor,
-    /// `sum(list)` of numbers; 0 of none
+    /// `sum(list)` of numbers; 0 for an empty list
     Sum,
-    /// `if(condition, a, b)`; only the chosen one is evaluated
+    /// `if(condition, a, b)`; only the chosen branch is evaluated
     If,
-    /// `either(a, b, …)`: the first whose outputs were written on the way to where it is evaluated, or have defaults; else the last. Only
-    /// that is evaluated.
+    /// `either(a, b, …)`: the first argument whose outputs have been written on the way to this place, or have defaults; else the last. Only
+    /// this argument is evaluated.
     Either,
     /// `pose(x, y, z)` or `pose(x, y, z, roll, pitch, yaw)`: metres, radians
     Pose,
@@ -157,12 +157,11 @@ pub enum Function {
     Distance,
     /// `angle(a, b)` by which two orientations differ, radians, 0 to π
     Angle,
-    /// `grasp_pose({pose, size})` → list of poses of the gripper's tool frame that take the box from above, fingers
-    /// across its shorter horizontal side: the two that differ by half a turn; with `class: Bowl` or `Plate`, those around its
-    /// rim
+    /// `grasp_pose({pose, size})` → list of poses of the gripper's tool frame that grasp the box from above, with the fingers across its
+    /// shorter horizontal side: two, half a turn apart; with `class: Bowl` or `Plate`, the poses around its rim
     GraspPose,
-    /// `place_pose(target, in_gripper, turns)` → list of the tool poses that bring a held object to the pose `target`, which looks
-    /// the same after each of so many equal turns about its z axis; two unless said
+    /// `place_pose(target, in_gripper, turns)` → list of the tool poses that bring a held object to the pose `target`. The object looks the
+    /// same after each of `turns` equal turns about its z axis (default: 2)
     PlacePose,
     /// `concat(a, b, …)` of strings, ints
     Concat,
@@ -170,11 +169,11 @@ pub enum Function {
     Repeat,
     /// `take(list, n)` → the first n elements, or all if there are fewer
     Take,
-    /// `sort(list)` of numbers or of strings, the least first
+    /// `sort(list)` of numbers or of strings, in increasing order
     Sort,
     /// `reverse(list)`
     Reverse,
-    /// `unique(list)` → each element where it stands first
+    /// `unique(list)` → the elements without duplicates, in order
     Unique,
     /// `starts_with(text, prefix)` → bool
     StartsWith,

@@ -1,4 +1,4 @@
-//! The names of facts: keys, patterns over keys, and bound changes. The facts themselves are kept in `ratn-world`.
+//! Names of facts: keys, patterns over keys, and bound changes. The facts themselves are stored in `ratn-world`.
 
 use crate::value::Value;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -13,7 +13,7 @@ pub enum Term {
     Name(String),
 }
 
-/// `predicate(argument, …)`: what a fact gives a value to.
+/// `predicate(argument, …)`: the key of a fact.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct FactKey {
     /// Its predicate.
@@ -22,7 +22,7 @@ pub struct FactKey {
     pub arguments: Vec<Term>,
 }
 
-/// `predicate(argument or ?, …)`: the keys of one predicate and arity whose arguments fit.
+/// `predicate(argument or ?, …)`: the keys of one predicate and arity whose arguments match.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct FactPattern {
     /// The predicate.
@@ -35,7 +35,7 @@ pub struct FactPattern {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Footprint {
-    /// Every fact: what a state without the annotation reads or writes.
+    /// Every fact: the footprint of a state without the annotation.
     Everything,
     /// The union of these; empty means none.
     Patterns(Vec<FactPattern>),
@@ -47,21 +47,21 @@ pub enum Footprint {
 pub enum Change {
     /// The fact has this value from now on.
     Set {
-        /// Which fact.
+        /// The fact.
         fact: FactKey,
         /// Its value.
         value: Value,
     },
-    /// Every matching fact is gone from now on.
+    /// Every matching fact is removed.
     Delete {
-        /// Which facts.
+        /// The facts.
         pattern: FactPattern,
     },
-    /// A numeric fact grows by this much (an absent one counts as 0).
+    /// A numeric fact increases by this amount; an absent fact counts as 0.
     Increase {
-        /// Which fact.
+        /// The fact.
         fact: FactKey,
-        /// By how much; negative decreases.
+        /// The amount; a negative one decreases.
         by: f64,
     },
 }
@@ -70,7 +70,7 @@ pub enum Change {
 pub const SCENE_PREDICATES: [(&str, usize); 5] =
     [("at", 1), ("shape", 1), ("in_gripper", 1), ("in_gripper", 2), ("on", 2)];
 
-/// As people write it, without saying which kind it is.
+/// Text form, as people write it, without a tag for the kind of term.
 #[derive(Serialize, Deserialize)]
 #[serde(remote = "Term", untagged)]
 enum WrittenTerm {
@@ -78,7 +78,7 @@ enum WrittenTerm {
     Name(String),
 }
 
-/// In bytes, which do not say of themselves what they are.
+/// Binary form, with a tag, because bytes do not show the kind of term.
 #[derive(Serialize, Deserialize)]
 #[serde(remote = "Term")]
 enum TaggedTerm {
@@ -110,21 +110,21 @@ impl FactPattern {
         FactPattern { predicate: key.predicate.clone(), arguments: key.arguments.iter().cloned().map(Some).collect() }
     }
 
-    /// Whether `key` fits.
+    /// Whether `key` matches.
     pub fn matches(&self, key: &FactKey) -> bool {
         self.predicate == key.predicate
             && self.arguments.len() == key.arguments.len()
             && self.arguments.iter().zip(&key.arguments).all(|(want, have)| want.as_ref().is_none_or(|w| w == have))
     }
 
-    /// Whether every key that fits `other` fits this one.
+    /// Whether every key that matches `other` matches this pattern.
     pub fn covers(&self, other: &FactPattern) -> bool {
         self.predicate == other.predicate
             && self.arguments.len() == other.arguments.len()
             && self.arguments.iter().zip(&other.arguments).all(|(mine, its)| mine.is_none() || mine == its)
     }
 
-    /// Whether some key fits both.
+    /// Whether some key matches both.
     pub fn overlaps(&self, other: &FactPattern) -> bool {
         self.predicate == other.predicate
             && self.arguments.len() == other.arguments.len()
@@ -139,12 +139,12 @@ impl Footprint {
     /// No fact.
     pub const NOTHING: Footprint = Footprint::Patterns(Vec::new());
 
-    /// Whether no fact is in it.
+    /// Whether it contains no fact.
     pub fn is_nothing(&self) -> bool {
         matches!(self, Footprint::Patterns(patterns) if patterns.is_empty())
     }
 
-    /// Whether `key` is in it.
+    /// Whether it contains `key`.
     pub fn contains(&self, key: &FactKey) -> bool {
         match self {
             Footprint::Everything => true,
@@ -152,7 +152,7 @@ impl Footprint {
         }
     }
 
-    /// Whether some fact may be in both.
+    /// Whether both may contain a common fact.
     pub fn overlaps(&self, other: &Footprint) -> bool {
         match (self, other) {
             (Footprint::Everything, o) | (o, Footprint::Everything) => !o.is_nothing(),

@@ -1,34 +1,34 @@
-//! How a parallel gripper takes things from above, as poses of its tool frame in the frame of the things' poses.
+//! Grasps from above with a parallel gripper, as poses of its tool frame, in the frame of the objects' poses.
 //!
-//! One thing is known about the gripper: its tool frame sits between the fingertips, which reach [`FINGERTIP_M`] beyond it; z points
-//! out of the gripper, y is the direction in which the fingers close. What stands there stands upright: yaw is all that is asked of a
-//! pose's rotation.
+//! Assumptions about the gripper: its tool frame is between the fingertips, which reach [`FINGERTIP_M`] beyond it; z points out of the
+//! gripper, y is the direction in which the fingers close. Objects stand upright: of a pose's rotation only the yaw is used.
 
 use crate::pose::Pose;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-/// How far below an object's top the tool frame's origin goes in a grasp from above, in metres; half the height of something lower than
-/// twice that, but never so low that the fingertips touch what it stands on.
+/// Depth of the tool frame's origin below an object's top in a grasp from above, in metres. At most half the height of the object; and
+/// never so deep that the fingertips touch the surface below it.
 pub const GRASP_DEPTH_M: f64 = 0.03;
 
-/// How far the fingers reach beyond the tool frame's origin, in metres.
+/// Length of the fingertips beyond the tool frame's origin, in metres.
 pub const FINGERTIP_M: f64 = 0.015;
 
-/// How far the fingertips stay above what an object stands on, in metres.
+/// Clearance of the fingertips above the surface below an object, in metres.
 const CLEARANCE_M: f64 = 0.002;
 
-/// How far below its rim the fingertips take something, and how far from the edge their middle is, in metres: walls lean.
+/// Depth of the fingertips below the rim, and distance of their middle from the edge, in metres; the distance is needed because walls
+/// lean.
 const RIM_DEPTH_M: f64 = 0.02;
 const RIM_INSET_M: f64 = 0.005;
 
-/// Ways to turn the fingers around something round, in half a turn; after that they are the same fingers.
+/// Number of rotations of the fingers around a round object within half a turn; after half a turn the grasp repeats.
 const TURNS: u32 = 8;
 
-/// Places around a rim.
+/// Number of grasp positions around a rim.
 const AROUND: u32 = 16;
 
-/// The two ways to take something from above, half a turn apart: the fingers close across its shorter horizontal edge. `centre` is the
-/// middle of its bounding box, `size` that one's edges in metres.
+/// The two grasps of a box from above, half a turn apart: the fingers close across its shorter horizontal edge. `centre` is the middle
+/// of its bounding box, `size` are the edges of the bounding box in metres.
 pub fn from_above(centre: &Pose, size: [f64; 3]) -> [Pose; 2] {
     let [x, y, z] = size;
     // Turned upside down (roll π), the tool's y axis points along -y of the object; a quarter turn puts it along x.
@@ -40,14 +40,15 @@ pub fn from_above(centre: &Pose, size: [f64; 3]) -> [Pose; 2] {
     [turned(0.0), turned(PI)]
 }
 
-/// The ways to take something round from above that is narrower than the fingers open: they close around it from any side. As
+/// Grasps from above of a round object that is narrower than the opened fingers: they close around it from any side. Arguments as in
 /// [`from_above`].
 pub fn around(centre: &Pose, size: [f64; 3]) -> Vec<Pose> {
     let turned = |i: u32| Pose::from_rpy([0.0; 3], 0.0, 0.0, PI * f64::from(i) / f64::from(TURNS));
     (0..TURNS).flat_map(|i| from_above(&centre.compose(&turned(i)), size)).collect()
 }
 
-/// The ways to take something round and open by its rim, all around it and each with either finger inside. As [`from_above`].
+/// Grasps of a round, open object by its rim, at every position around it and with either finger inside. Arguments as in
+/// [`from_above`].
 pub fn at_rim(centre: &Pose, size: [f64; 3]) -> Vec<Pose> {
     let [width, _, height] = size;
     let radius = width / 2.0 - RIM_INSET_M;

@@ -1,5 +1,5 @@
-//! States that are tried again, states that are watched, states with something to do on every way out, and loops that collect what each
-//! iteration gives, in terms of the transitions, scoped variables and conditions that every program has. Both modes and routines execute them as they execute those.
+//! `retry`, `while`, `timeout`, `finally` and collected outputs of loops, expressed by the transitions, scoped variables and conditions that every program has.
+//! So both modes and routines execute them without further support.
 //!
 //! ```text
 //! grasp: retry {times: 2, on: [aborted], before: [open]}       finally: [tuck]
@@ -11,21 +11,21 @@
 //!
 //! carry: while [lit(lamp)], timeout 20
 //!
-//! carry ┬ while    ─ violated ► violated        all of them at once: the first that ends stops the others
+//! carry ┬ while    ─ violated ► violated        all at the same time: the first that ends stops the others
 //!       ├ timeout  ─ aborted ─► aborted
 //!       └ body     ─────────────► as it ends
 //!
 //! for: outputs {all: {each: look.boxes}}
 //!
-//! loop ── pass     the body; at its end `look.boxes` is added to the list that is the output `all`
+//! loop ── pass     the body; at its end `look.boxes` is appended to the list that becomes the output `all`
 //! ```
 //!
-//! Each try is watched anew; what is done on every way out is not watched.
+//! Each try is watched anew; a `finally` is not watched.
 //!
-//! The state that was written is `try` or `body`; with both, `body` is what holds `try`. From outside, the state of its name is seen, with
-//! the same ports. Names of variables that are made here cannot be written in a task file.
+//! The state in the file becomes `try` or `body`; with both, `body` contains `try`. From outside, only the state with its name is visible, with the same ports.
+//! The variables that are introduced here have names that cannot be written in a task file.
 //!
-//! Where a state is cut short from outside (a lost race, a limit around it, the end of the run), the executive goes on with `finally_preempted`.
+//! If a state is cut short from outside (a lost race, a timeout around it, the end of the run), the executive continues with `finally_preempted`.
 
 use crate::expression::{BinaryOperator, Expr};
 use crate::id::StateId;
@@ -38,70 +38,70 @@ use crate::value::{Type, Value};
 use crate::wait::{LIMIT, PAUSE, WATCH};
 use std::collections::BTreeMap;
 
-/// More states than this are not made.
+/// Limit of the number of states.
 const MAX_STATES: usize = 20_000;
 
-/// What stands around a state.
+/// `retry`, `while`, `timeout`, `finally` and `each` of a state.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Guard {
-    /// How it is tried again.
+    /// `retry`, if it is not left to the executive.
     pub retried: Option<Retried>,
-    /// How it is watched while it goes on.
+    /// `while` and `timeout`, unless the executive handles them.
     pub limits: Option<Limits>,
-    /// What is done on every way out; states whose parent is the guarded one, and that are in none of its lists.
+    /// `finally`: states whose parent is the guarded state, but which are in none of its lists.
     pub finally: Vec<StateId>,
-    /// Of a loop: the outputs that have a value of each iteration.
+    /// For a loop: the outputs that collect a value of each iteration.
     pub collected: Vec<Collected>,
 }
 
-/// An output of a loop that is a list: a value of each iteration that ended well.
+/// An output of a loop that is a list: one value of each iteration that ended well.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Collected {
-    /// The output. Whatever its value is said to be, it is this list.
+    /// The output's name. Its value is this list, whatever its expression says.
     pub name: String,
-    /// Evaluated at the end of an iteration, in the scope of the body.
+    /// Evaluated at the end of each iteration, in the scope of the body.
     pub value: Expr,
 }
 
-/// What ends a state before its own end. It becomes one node of the program (a preemptive concurrency is one).
+/// `while` and `timeout` of a state, which becomes a preemptive concurrency and so one node of the program.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Limits {
-    /// Booleans that must hold in the actual world as long as it goes on; else it ends [`VIOLATED`].
+    /// Booleans that must hold in the actual world while the state runs; else it ends [`VIOLATED`].
     pub holds: Vec<Expr>,
-    /// It ends `aborted` when it has taken so long, in the robot's seconds.
+    /// Timeout in the robot's seconds; the state then ends `aborted`.
     pub timeout_s: Option<f64>,
 }
 
-/// Whether a variable was made here or for an output: no file can say its name.
+/// Whether a variable was introduced by the loader; a file cannot name it.
 pub fn is_made(variable: &str) -> bool {
     variable.contains(' ')
 }
 
-/// How a state is tried again.
+/// `retry` of a state.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Retried {
-    /// How many tries after the first.
+    /// Number of tries after the first.
     pub count: u32,
     /// The pause before the second try, doubled before each further one.
     pub backoff_s: f64,
-    /// The outcomes after which it is.
+    /// The outcomes after which the state is tried again.
     pub on: Vec<String>,
-    /// What is done before each further try; states as those of [`Guard::finally`].
+    /// Executed before each further try; states as in [`Guard::finally`].
     pub before: Vec<StateId>,
 }
 
-/// Where the states of a program are after [`unfold`]: of each the ids, the outermost first. The last is the state as it was written. What is
-/// done on every way out is there once for each way.
+/// The ids of every state of the file after [`unfold`], the outermost first; the last one is the state as written. The states of a `finally` are copied once
+/// per outcome.
 pub type Places = BTreeMap<StateId, Vec<StateId>>;
 
-/// There would be more than 20,000 states.
+/// Error: there would be more than 20,000 states.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TooManyStates;
 
-/// Puts what guards say into the program. States get other ids.
+/// Expands the guards into states of the program. States get new ids.
 ///
 /// # Errors
-/// There would be too many states: what is done on every way out is there once for each outcome.
+/// There would be too many states: a `finally` is copied once per outcome.
 pub fn unfold(program: &mut Program, guards: &BTreeMap<StateId, Guard>) -> Result<Vec<Places>, TooManyStates> {
     let outcomes = program.all_outcomes();
     let scopes = vec![Scope { around: None, places: Places::new() }];
@@ -119,7 +119,7 @@ pub fn unfold(program: &mut Program, guards: &BTreeMap<StateId, Guard>) -> Resul
     Ok(places)
 }
 
-/// States that were copied together: those of one `finally`, for one outcome.
+/// The copies of the states of one `finally`, for one outcome.
 struct Scope {
     around: Option<usize>,
     places: Places,
@@ -129,16 +129,16 @@ struct Unfolding<'a> {
     old: &'a [State],
     guards: &'a BTreeMap<StateId, Guard>,
     outcomes: Vec<Vec<String>>,
-    /// With lists of new ids, and with the old ones in transitions and expressions.
+    /// New states: their lists have new ids, their transitions and expressions still have old ones.
     new: Vec<State>,
-    /// By new id.
+    /// Scopes by new id.
     of_scope: Vec<usize>,
     scopes: Vec<Scope>,
     /// Transitions between new ids.
     links: Vec<(StateId, String, Target)>,
-    /// Output ports that are those of a state within.
+    /// Guard states that take over the output ports of an inner state.
     outputs: Vec<(StateId, StateId)>,
-    /// Marks with new ids.
+    /// `again` annotations, with new ids.
     again: Vec<(StateId, Again)>,
     lastly: Vec<(StateId, Finally)>,
 }
@@ -148,7 +148,7 @@ impl Unfolding<'_> {
         &self.old[id.0 as usize]
     }
 
-    /// A state with what stands around it; `name` instead of its own.
+    /// Copies a state with its guard; `name` replaces its own name.
     fn guarded(
         &mut self,
         id: StateId,
@@ -166,7 +166,7 @@ impl Unfolding<'_> {
         }
     }
 
-    /// The state with what watches it.
+    /// Copies a state with its `while` and `timeout`.
     fn watched(
         &mut self,
         id: StateId,
@@ -180,7 +180,7 @@ impl Unfolding<'_> {
             return self.written(id, parent, name, scope, is_outermost);
         };
         let around = self.around(id, parent, name, scope, is_outermost)?;
-        // What does not hold at the beginning is seen before anything begins.
+        // The watch is first: it must find a false condition before anything begins.
         let mut regions = Vec::new();
         if !limits.holds.is_empty() {
             let conditions = limits.holds.iter().map(|condition| ("for".to_owned(), condition.clone()));
@@ -194,7 +194,7 @@ impl Unfolding<'_> {
         regions.push(body);
         self.outputs.push((around, body));
         self.at(body).outcomes.retain(|outcome| outcome != VIOLATED);
-        // These ends are not the body's, which is cut short.
+        // These outcomes end the concurrency; the body is cut short.
         let ends = [(PREEMPTED, true), (VIOLATED, !limits.holds.is_empty()), (ABORTED, limits.timeout_s.is_some())];
         for (outcome, _) in ends.into_iter().filter(|(_, ends)| *ends) {
             if let Some(effects) = self.at(body).annotations.effects.remove(outcome) {
@@ -207,7 +207,7 @@ impl Unfolding<'_> {
         Ok(around)
     }
 
-    /// A state that the executive waits in, which changes nothing and ends by this outcome.
+    /// Adds a state in which the executive waits; it changes nothing and ends by this outcome.
     fn wait(
         &mut self,
         id: StateId,
@@ -225,7 +225,7 @@ impl Unfolding<'_> {
         Ok(wait)
     }
 
-    /// The state as it was written.
+    /// Copies the state as written.
     fn written(
         &mut self,
         id: StateId,
@@ -275,7 +275,7 @@ impl Unfolding<'_> {
         Ok(new)
     }
 
-    /// The body of a loop; within a state that says at its end what this iteration gives, where the loop collects that ([`Program::is_pass`]).
+    /// Copies the body of a loop, put into a state that appends this iteration's values at its end if the loop collects any ([`Program::is_pass`]).
     fn passes(
         &mut self,
         id: StateId,
@@ -299,7 +299,7 @@ impl Unfolding<'_> {
         Ok(vec![pass])
     }
 
-    /// It is tried again.
+    /// Copies a state with its `retry`.
     fn with_retry(
         &mut self,
         id: StateId,
@@ -365,7 +365,7 @@ impl Unfolding<'_> {
         Ok(around)
     }
 
-    /// Something is done on every way out.
+    /// Copies a state with its `finally`.
     fn with_finally(
         &mut self,
         id: StateId,
@@ -404,7 +404,7 @@ impl Unfolding<'_> {
         Ok(around)
     }
 
-    /// The state that is seen from outside.
+    /// Adds the state that is visible from outside.
     fn around(
         &mut self,
         id: StateId,
@@ -440,7 +440,7 @@ impl Unfolding<'_> {
         self.push(state, Some(parent), scope)
     }
 
-    /// Only a step: out of the list by an outcome.
+    /// Adds a state that only leaves its list by an outcome.
     fn step(
         &mut self,
         id: StateId,
@@ -510,7 +510,7 @@ impl Unfolding<'_> {
         self.scopes[scope].places.entry(old).or_default().push(new);
     }
 
-    /// The states with new ids in transitions and expressions.
+    /// The new states, with new ids in transitions and expressions, too.
     fn resolved(&self) -> Vec<State> {
         let mut states = self.new.clone();
         for state in &mut states {
@@ -532,7 +532,7 @@ impl Unfolding<'_> {
         for (from, outcome, to) in &self.links {
             states[from.0 as usize].transitions.insert(outcome.clone(), to.clone());
         }
-        // The inner ones were made first.
+        // Inner states were made first.
         for (around, body) in &self.outputs {
             let port = |name: &String, ty: &Type| {
                 let value = Expr::Port { state: *body, port: name.clone() };
@@ -560,9 +560,8 @@ impl Unfolding<'_> {
         }
     }
 
-    /// Which of the states around an old one is meant: the outermost that does not contain where it is named, and is not watched there. Inside of
-    /// all of them, and where it is watched, it is the outermost, as it was when it was left the last time: what stands around a state changes
-    /// nothing of what it sees of itself.
+    /// The new state that an expression in `from` means by an old state: the outermost one that does not contain `from` and is not watched beside it. If there
+    /// is none, the outermost one, with the outputs of its last visit: a guard does not change what a state sees of itself.
     fn seen_from(&self, from: StateId, old: StateId) -> StateId {
         let layers = self.layers(from, old);
         let up = |id: &StateId| self.new[id.0 as usize].parent;
@@ -575,12 +574,12 @@ impl Unfolding<'_> {
         layers.iter().find(is_outside).or(layers.first()).copied().unwrap_or(old)
     }
 
-    /// Where a transition to an old state leads: to the outermost, with all that stands around it.
+    /// The target of a transition to an old state: the outermost new state, with the whole guard.
     fn entered_from(&self, from: StateId, old: StateId) -> StateId {
         self.layers(from, old).first().copied().unwrap_or(old)
     }
 
-    /// What an old state became, where a new one can see it.
+    /// The new states of an old state that are visible from a new state.
     fn layers(&self, from: StateId, old: StateId) -> &[StateId] {
         let mut scope = Some(self.of_scope[from.0 as usize]);
         while let Some(at) = scope {
@@ -593,7 +592,7 @@ impl Unfolding<'_> {
     }
 }
 
-/// A state that does and says nothing, where another stands in the file.
+/// A state that does nothing, at the location of another one in the file.
 fn bare(old: &State, name: String, kind: StateKind) -> State {
     let effects = [(SUCCESS.to_owned(), Vec::new())].into();
     State {
@@ -617,7 +616,7 @@ fn bare(old: &State, name: String, kind: StateKind) -> State {
     }
 }
 
-/// Those that not every state has.
+/// The outcomes that not every state has.
 fn own<'n>(outcomes: impl IntoIterator<Item = &'n str>) -> Vec<String> {
     let is_common = |outcome: &&str| [SUCCESS, ABORTED, PREEMPTED].contains(outcome);
     outcomes.into_iter().filter(|outcome| !is_common(outcome)).map(str::to_owned).collect()

@@ -1,6 +1,6 @@
 //! Ids as newtypes, all from one macro, so that one kind is never passed for another.
 
-/// Defines a `u64` id newtype with `Display` as `prefix` + number. It is read as that, and as the number alone.
+/// Defines a `u64` id newtype, displayed as `prefix` + number. It is parsed from that form or from the number alone.
 #[macro_export]
 macro_rules! number_id {
     ($(#[$doc:meta])* $name:ident, $prefix:literal) => {
@@ -41,7 +41,7 @@ number_id!(
     LeaseId, "lease-"
 );
 number_id!(
-    /// A strictly growing number that fences a lease: who does the work refuses an older one.
+    /// A strictly increasing number that fences a lease: a provider refuses a smaller token than it has seen.
     FencingToken, "token-"
 );
 number_id!(

@@ -1,5 +1,5 @@
-//! What is in force for each state that performs an action, and who says so: the state, its action in the catalogue, or nobody. For people who
-//! wonder why a state waits.
+//! The annotations in force for each state that performs an action, and their origin: the state, its action in the catalogue, or a default.
+//! Helps to find out why a state waits.
 
 use crate::check::{name_state, named};
 use crate::expression::{EffectExpr, Expr, FactExpr};
@@ -8,14 +8,14 @@ use crate::resource::Quantity;
 use serde::Serialize;
 use std::fmt::Display;
 
-/// One state.
+/// The annotations of one state.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct InForce {
     /// Its path.
     pub state: String,
     /// `provider/action`
     pub action: String,
-    /// What holds for it.
+    /// Its annotations.
     pub lines: Vec<Line>,
 }
 
@@ -24,13 +24,13 @@ pub struct InForce {
 pub struct Line {
     /// The key of a task file.
     pub key: &'static str,
-    /// What is in force under it, as a task file says it; `everything`, `nothing`, `unknown` where there is no text.
+    /// Its value as in a task file; `everything`, `nothing` or `unknown` if there is no text.
     pub text: String,
-    /// Who says so; nobody where it is so because nothing is said.
+    /// Where it comes from; `None` for a default.
     pub from: Option<Origin>,
 }
 
-/// What is in force for every state that performs an action, in the order of the program.
+/// The annotations in force for every state that performs an action, in program order.
 pub fn in_force(program: &Program) -> Vec<InForce> {
     let states = program.states.iter().filter(|state| !state.is_pause());
     let of_state = states.filter_map(|state| match &state.kind {
@@ -51,11 +51,11 @@ fn lines(program: &Program, said: &Annotations) -> Vec<Line> {
     let changed = |effects: &[EffectExpr]| listed(effects, |effect| effect.each_expression_mut(&mut |part| name(part)));
     let unknown = || "unknown".to_owned();
     let everything = || "everything".to_owned();
-    // Of other outcomes, those that change something.
+    // Other outcomes are listed only if they change something.
     let mut effects = vec![said.effects.get(SUCCESS).map_or_else(everything, |effects| changed(effects))];
     let others = said.effects.iter().filter(|(outcome, effects)| *outcome != SUCCESS && !effects.is_empty());
     effects.extend(others.map(|(outcome, effects)| format!("{outcome}: {}", changed(effects))));
-    // A projection that nobody asks for is told for itself.
+    // A projection that is only implied gets a line of its own.
     let implied = said.origin.get(WORLD_MODEL).copied();
     let (room, own): (Vec<ResourceExpr>, Vec<ResourceExpr>) =
         said.resources.iter().cloned().partition(|line| implied.is_some() && line.kind == WORLD_MODEL);
@@ -95,7 +95,7 @@ fn resources(program: &Program, lines: &[ResourceExpr]) -> String {
     lines.iter().map(shown).collect::<Vec<_>>().join("; ")
 }
 
-/// With the names of states in the place of their numbers.
+/// A list as text, with the names of states instead of their ids.
 fn listed<T: Display + Clone>(items: &[T], name: impl Fn(&mut T)) -> String {
     if items.is_empty() {
         return "nothing".to_owned();
@@ -112,7 +112,7 @@ mod tests {
     use crate::catalogue::Catalogue;
     use crate::load::load;
 
-    /// `s1.` is how an output of the first state is displayed by itself.
+    /// The text `s1.` is also how an output of the first state would be displayed.
     #[test]
     fn a_text_that_looks_like_a_state_stays_what_it_is() {
         let task = r#"

@@ -1,8 +1,8 @@
 //! The task model: what a task program *is*.
 //!
-//! Owns the values that flow between states, the expression grammar, the tree of states with its annotations
-//! ([`program::Program`]), the catalogue of what a system offers, loading from YAML and the rules of `check`.
-//! It deliberately knows no clock, no socket, no process and no world: facts are named here, kept in `ratn-world`.
+//! Contains the values that flow between states, the expression grammar, the tree of states with its annotations
+//! ([`program::Program`]), the catalogue of a system, loading from YAML and the rules of `check`. It has no clock,
+//! socket, process or world: facts are only named here; they are stored in `ratn-world`.
 
 pub mod catalogue;
 pub(crate) mod check;

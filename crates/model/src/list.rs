@@ -1,8 +1,8 @@
-//! Lists that are cheap to copy and to append to: a loop that collects a value of each iteration has a list per iteration, each the one before
-//! with one element behind it.
+//! Lists that are cheap to copy and to append to: a loop that collects a value of each iteration makes one list per iteration, each with one
+//! element more than the one before.
 //!
-//! All these share one buffer, of which each sees its own first elements. The first list that is appended to takes the next free slot; where that
-//! has another element by then, or none is left, the elements are copied into a buffer of twice the size.
+//! All these lists share one buffer; each list uses a prefix of it. The first append takes the next free slot. If another list has already stored
+//! a different element there, or no slot is left, the elements are copied into a buffer of twice the size.
 //!
 //! ```text
 //! [a, b]      ─┐
@@ -17,34 +17,34 @@ use std::iter::repeat_with;
 use std::ops::Index;
 use std::sync::{Arc, OnceLock};
 
-/// A list that is appended to has room for so many elements at the least.
+/// Smallest capacity of the buffer of a list that is appended to.
 const LEAST_ROOM: usize = 4;
 
-/// A list that is read back has room for so many elements at first, whatever is said of its length.
+/// Limit of the initial capacity of a list that is deserialized, whatever length the data claims.
 const MOST_TRUSTED: usize = 4096;
 
 /// The elements of a [`Value::List`]. Copies share them.
 #[derive(Clone)]
 pub struct List {
-    /// Those of this list, and of longer ones that were made of it; none behind the first that is empty.
+    /// The elements of this list and of longer ones that share the buffer; no element follows an empty slot.
     slots: Arc<[OnceLock<Value>]>,
     len: usize,
 }
 
 impl List {
-    /// Without elements.
+    /// An empty list.
     #[must_use]
     pub fn new() -> List {
         List::with_room(Vec::new(), 0)
     }
 
-    /// How many elements.
+    /// Number of elements.
     #[must_use]
     pub fn len(&self) -> usize {
         self.len
     }
 
-    /// Whether there are none.
+    /// Whether the list is empty.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len == 0
@@ -68,12 +68,12 @@ impl List {
         self.get(0)
     }
 
-    /// Puts an element behind the others; other copies of the list stay as they are.
+    /// Appends an element; other copies of the list do not change.
     pub fn push(&mut self, element: Value) {
         let Some(next) = self.slots.get(self.len) else { return self.push_into_a_copy(element) };
         match next.set(element) {
             Ok(()) => self.len += 1,
-            // The same was put there by another copy: it is made twice of the same.
+            // Another copy has stored an equal element there, so the slot can be shared.
             Err(element) if next.get().is_some_and(|there| there.total_order(&element).is_eq()) => self.len += 1,
             Err(element) => self.push_into_a_copy(element),
         }
@@ -251,7 +251,7 @@ mod tests {
             assert_eq!(*list, ints(0..n));
             assert_eq!(list.get(list.len()), None, "what others have behind it is not seen");
         }
-        // Of each another one is made, which differs in its last element.
+        // A second list from each one, which differs in its last element.
         for (n, list) in (0..).zip(&lists[..100]) {
             let other = with(list, -1);
             assert_eq!((other.len(), other.iter().next_back()), (list.len() + 1, Some(&Value::Int(-1))));

@@ -1,8 +1,8 @@
-//! Task file → [`Program`].
+//! Loading: task file → [`Program`].
 //!
-//! In three passes: the outline (which states there are, and their order), the expressions (with every name resolved), and
-//! the rules of `check`. Everything that is wrong is collected, each with its place; a program comes out only if
-//! nothing is. What the format will have and does not have yet is refused by name, never ignored.
+//! In three passes: the outline (which states there are, in which order), the expressions (with every name resolved), and the rules of `check`.
+//! All errors are collected, each with its location; a program is returned only if there is none. Features that are planned but missing are
+//! refused by name, never ignored.
 //!
 //! ```yaml
 //! task: name
@@ -63,7 +63,7 @@ use outline::{Form, Outline};
 use std::collections::BTreeMap;
 use yaml::{Content, Node};
 
-/// The horizon of a task that names none.
+/// The default horizon.
 pub const DEFAULT_HORIZON: usize = 120;
 
 const TASK_KEYS: [&str; 15] = [
@@ -84,12 +84,12 @@ const TASK_KEYS: [&str; 15] = [
     "states",
 ];
 
-/// A program and what was noticed about it.
+/// A program and its warnings.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Loaded {
     /// The program.
     pub program: Program,
-    /// Findings that do not refuse it.
+    /// Findings that do not cause a refusal.
     pub warnings: Vec<Diagnostic>,
 }
 
@@ -114,11 +114,11 @@ pub fn load_with(
     load_beginning(source, file, catalogue, files, None)
 }
 
-/// As [`load_with`], of a run that begins at the state of this name of the task's own list, in the world as it is then: what the task says of the
-/// initial world is not written, and what earlier states give may not be needed.
+/// As [`load_with`], for a run that begins at the state of this name in the task's own list, in the present world: the task's initial world is
+/// not written, and outputs of earlier states may be missing.
 ///
 /// # Errors
-/// As [`load_with`]; and where there is no such state.
+/// As [`load_with`]; also if there is no such state.
 pub fn load_beginning(
     source: &str,
     file: &str,
@@ -130,18 +130,18 @@ pub fn load_beginning(
     load_within(source, &Loading { file, catalogue, files, known: &known, around: Vec::new(), from })
 }
 
-/// What a file is loaded with.
+/// The context of loading one file.
 #[derive(Clone)]
 pub(crate) struct Loading<'a> {
-    /// Its name.
+    /// The file's name.
     pub(crate) file: &'a str,
     pub(crate) catalogue: &'a Catalogue,
     pub(crate) files: &'a dyn Files,
-    /// What has been loaded already.
+    /// Libraries that are already loaded.
     pub(crate) known: &'a library::Known,
-    /// The files that use it, outermost first.
+    /// The files that use this one, outermost first.
     pub(crate) around: Vec<String>,
-    /// The state at which it begins; the first one unless said.
+    /// The state at which the run begins; by default the first one.
     pub(crate) from: Option<&'a str>,
 }
 
@@ -157,7 +157,7 @@ pub(crate) fn load_within(source: &str, loading: &Loading<'_>) -> Result<Loaded,
         check::check(program, loading.catalogue, &said, &mut out.findings);
     }
     let refused = out.findings.has_errors();
-    // The warnings of a library have been given with its own name.
+    // Warnings of a library were reported under its own name.
     let own = |finding: &Diagnostic| {
         let below = |path: &String| finding.path.strip_prefix(path.as_str()).is_some_and(|rest| rest.starts_with('/'));
         finding.severity == Severity::Error
@@ -235,7 +235,7 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     }
     let ids = (0..task.outline.steps.len()).map(|i| crate::id::StateId(i as u64));
     let mut states: Vec<_> = ids.map(|id| state::state(&task, id, out)).collect();
-    // The task's outputs are the root's.
+    // The task's outputs are stored in the root.
     let outputs: Vec<TaskOutput> = match &mut states[0].kind {
         StateKind::Sequence { outputs, .. } => std::mem::take(outputs),
         _ => Vec::new(),
@@ -244,7 +244,7 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     hasher.update(source.as_bytes());
     hasher.update(ontology_text.unwrap_or_default().as_bytes());
     hasher.update(loading.from.unwrap_or_default().as_bytes());
-    // What actions say belongs to the task, as what its libraries say does.
+    // The digest includes the annotations of used actions, like the texts of libraries.
     for (action, said) in said_by_actions(&states, catalogue) {
         hasher.update(action.as_bytes());
         hasher.update(said.as_bytes());
@@ -291,8 +291,8 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     Some(program)
 }
 
-/// What actions say of states that do not say it themselves, as text, by action. A task that says everything itself is the same
-/// whatever the catalogue says.
+/// The annotations that states take from their actions, as text, by action. A task that says everything itself has the same digest whatever the
+/// catalogue says.
 fn said_by_actions(states: &[State], catalogue: &Catalogue) -> BTreeMap<String, String> {
     let relies = |state: &&State| state.annotations.origin.values().any(|origin| *origin != Origin::State);
     let said = |state: &State| {
@@ -318,7 +318,7 @@ fn horizon(fields: &mut Fields<'_, '_>, node: &Node) -> usize {
     }
 }
 
-/// The ontology that a task names, and its text.
+/// The ontology that a task names, with its text.
 fn ontology(node: &Node, loading: &Loading<'_>, findings: &mut Findings) -> Option<(Ontology, String)> {
     let mut refuse = |message: String, help: &str| findings.error("invalid-ontology", node.at, "", message, help);
     let Content::Text(path) = &node.content else {
@@ -344,7 +344,7 @@ fn ontology(node: &Node, loading: &Loading<'_>, findings: &mut Findings) -> Opti
     }
 }
 
-/// An error with the files in which it was found.
+/// An error with the names of the files that lead to it.
 fn said(error: &OntologyError) -> String {
     match error {
         OntologyError::Import { file, source } => format!("{file}: {}", said(source)),
@@ -396,7 +396,7 @@ fn read_parameters(fields: &mut Fields<'_, '_>, root: &Node) -> Vec<Parameter> {
     parameters
 }
 
-/// Complains of a default of another type.
+/// Reports a default of another type.
 fn of_type(fields: &mut Fields<'_, '_>, at: crate::program::Location, name: &str, ty: &Type, value: &Value) {
     if ty.accepts(value) {
         return;
@@ -428,7 +428,7 @@ fn declared_type(fields: &mut Fields<'_, '_>, node: &Node) -> Option<Type> {
     }
 }
 
-/// A type as text, or a mapping of fields to types.
+/// Parses a type: a text, or a mapping of fields to types.
 fn type_of(node: &Node) -> Result<Type, String> {
     match &node.content {
         Content::Text(text) => text.parse::<Type>().map_err(|error| error.to_string()),
@@ -440,7 +440,7 @@ fn type_of(node: &Node) -> Result<Type, String> {
     }
 }
 
-/// The output ports of every state: those of its action, narrowed by `out` where it is given.
+/// The output ports of every state: those of its action, or only those in `out` if that is given.
 fn ports(
     outline: &Outline<'_>,
     catalogue: &Catalogue,
@@ -496,7 +496,7 @@ fn ports(
     outline.steps.iter().enumerate().map(of_step).collect()
 }
 
-/// `{type: int, default: 0}` with either or both, and not the record of these two fields.
+/// Whether this is `{type: int, default: 0}`, with either or both, and not such a record type.
 fn is_port_form(node: &Node) -> bool {
     let entries = node.entries();
     !entries.is_empty()

@@ -1,36 +1,36 @@
-//! Where a measured fact comes from, and how sure it is.
+//! The source of a measured fact, and its certainty.
 
 use crate::fact::FactKey;
 use serde::{Deserialize, Serialize};
 
-/// What measured which of the facts that are written together.
+/// Measurements, by the fact that each belongs to.
 pub type Evidence = Vec<(FactKey, Measurement)>;
 
-/// What came with a fact that was measured.
+/// Additional data of a measured fact.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Measurement {
-    /// What measured it, `detector-2` or `wrist camera`; empty where nobody said.
+    /// The source, `detector-2` or `wrist camera`; empty if unknown.
     pub source: String,
-    /// How sure it is, where the source says so.
+    /// The certainty, if the source gives one.
     pub certainty: Option<Certainty>,
 }
 
-/// How sure a measured value is.
+/// The certainty of a measured value.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Certainty {
-    /// The probability that it is so, 0 to 1.
+    /// The probability that the value is correct, 0 to 1.
     Confidence(f64),
-    /// The covariance of the value's numbers, a square matrix row by row, in their units (of a pose x, y, z in metres and the
-    /// rotation about x, y and z in radians).
+    /// The covariance matrix of the value's numbers, row by row, in their units (for a pose: x, y, z in metres and the
+    /// rotations about x, y and z in radians).
     Covariance(Vec<f64>),
 }
 
-/// A matrix is not wider than this.
+/// Limit of the number of rows of a covariance matrix.
 pub const MAX_COVARIANCE_ROWS: usize = 64;
 
 impl Certainty {
-    /// Its kind, as an ontology names it.
+    /// The name of this kind of certainty in an ontology.
     pub fn name(&self) -> &'static str {
         match self {
             Certainty::Confidence(_) => "confidence",
@@ -38,10 +38,10 @@ impl Certainty {
         }
     }
 
-    /// What is wrong with it: a confidence outside 0 to 1, a matrix that is not square or too large, a number that is none.
+    /// Checks the certainty: a confidence within 0 to 1; a square matrix that is not too large; only finite numbers.
     ///
     /// # Errors
-    /// What it has to be.
+    /// The condition that does not hold.
     pub fn check(&self) -> Result<(), &'static str> {
         match self {
             Certainty::Confidence(p) if (0.0..=1.0).contains(p) => Ok(()),

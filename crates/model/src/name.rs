@@ -1,10 +1,10 @@
-//! What a name, an id or a line of text may not hold: characters that a person who reads it does not see, or takes for others. Two
-//! names that look the same would be two.
+//! Characters that names, ids and lines of text must not contain: those that a reader does not see or takes for others. With them,
+//! two different names could look the same.
 
 use std::ops::RangeInclusive;
 
-/// Beside control characters: format characters and other ones without a glyph (Unicode's `Default_Ignorable_Code_Point` and `Cf`),
-/// separators of lines, and spaces that are not the usual one.
+/// In addition to control characters: format characters and other characters without a glyph (Unicode's
+/// `Default_Ignorable_Code_Point` and `Cf`), line separators, and unusual spaces.
 const UNSEEN: [RangeInclusive<char>; 28] = [
     '\u{a0}'..='\u{a0}',
     '\u{ad}'..='\u{ad}',
@@ -36,12 +36,12 @@ const UNSEEN: [RangeInclusive<char>; 28] = [
     '\u{e0000}'..='\u{e0fff}',
 ];
 
-/// Whether a person who reads a text does not see this character, or takes it for a space.
+/// Whether a reader cannot see this character, or takes it for a space.
 pub fn is_unseen(character: char) -> bool {
     character.is_control() || UNSEEN.iter().any(|range| range.contains(&character))
 }
 
-/// What a kind of resource is called, in words: see [`is_kind`].
+/// The rule for names of resource kinds, in words; see [`is_kind`].
 pub const KIND_RULE: &str = "a letter, then letters, digits, `_` and `-`";
 
 /// Whether a text is the name of a kind of resource: a letter, then letters, digits, `_` and `-`, all of ASCII.

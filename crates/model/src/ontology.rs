@@ -1,15 +1,15 @@
-//! What a task's facts may say: classes, individuals and predicates, as an ontology in Turtle declares them ([`turtle`]).
+//! The ontology of a task: the classes, individuals and predicates of its facts, declared in Turtle ([`turtle`]).
 //!
-//! An ontology only checks. Nothing is inferred from it but subclasses, and what it does not know is refused by the name of the
-//! rule: by `ratn check` as far as the arguments are constants, by the executive when an effect is bound.
+//! An ontology is used only for checks. Nothing is inferred from it except subclasses. Violations are refused with the name of
+//! the rule: by `ratn check` as far as the arguments are constants, else by the executive when an effect is bound.
 //!
 //! | rule | refuses |
 //! |---|---|
 //! | `unknown-predicate` | a predicate that is not declared |
-//! | `outside-domain` | as many arguments as a predicate does not have; an individual of no class, or of another class |
+//! | `outside-domain` | a wrong number of arguments; an individual of no class, or of another class |
 //! | `outside-range` | a value of another type, or the name of an individual of another class |
-//! | `other-uncertainty` | a measurement that is sure in another way than a predicate declares, or a covariance of another width |
-//! | `not-functional` | a second fact of a functional predicate about one subject |
+//! | `other-uncertainty` | a measurement with another kind of certainty than the predicate declares, or a covariance of another size |
+//! | `not-functional` | a second fact of a functional predicate for one subject |
 
 pub mod turtle;
 
@@ -22,40 +22,40 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
-/// What facts may say.
+/// What facts may exist.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Ontology {
-    /// Every class with all classes that it is a subclass of, itself among them.
+    /// Every class with all its superclasses, including itself.
     classes: BTreeMap<String, BTreeSet<String>>,
-    /// Individuals whose names begin so are of this class.
+    /// By prefix of a name: the class of individuals whose names begin with it.
     named: BTreeMap<String, String>,
-    /// Individuals and the classes they were said to be of.
+    /// Individuals with their declared classes.
     individuals: BTreeMap<String, BTreeSet<String>>,
     predicates: BTreeMap<String, Predicate>,
 }
 
-/// A predicate: of what it may be said, and what it may say.
+/// A declared predicate.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Predicate {
-    /// What each argument is; their number is the predicate's arity.
+    /// The domain of each argument; their number is the predicate's arity.
     pub domain: Vec<Domain>,
-    /// What the value is.
+    /// The range of the value.
     pub range: Range,
-    /// Of the facts that differ in the last argument only, one holds at most (`on(box, ?)`: a box is on one thing).
+    /// Among the facts that differ in the last argument only, at most one holds (`on(box, ?)`: a box is on one thing).
     pub functional: bool,
-    /// Which difference between a predicted and a measured value is none; the rest is the task's.
+    /// Tolerance within which a measured value counts as the predicted one; parts that are `None` come from the task.
     pub tolerance: Deviation,
-    /// Its facts make the scene: `reads: [scene]` stands for them.
+    /// Whether the scene is derived from its facts: `reads: [scene]` includes them.
     pub geometric: bool,
-    /// A fact that was measured this many seconds ago and not again since is stale; `None`: it holds until it is changed.
+    /// Time to live in seconds: a measured fact is stale after it, unless measured again; `None`: it holds until it is changed.
     pub ttl_s: Option<f64>,
-    /// What its measured facts carry about how sure they are.
+    /// The certainty that its measured facts have.
     pub uncertainty: Option<Uncertainty>,
     /// The unit of its numbers, `kg`.
     pub unit: Option<String>,
 }
 
-/// How sure a measured fact is.
+/// The kind of certainty of a measured fact.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Uncertainty {
@@ -65,37 +65,37 @@ pub enum Uncertainty {
     Covariance,
 }
 
-/// What an argument of a predicate is.
+/// The domain of an argument.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Domain {
-    /// An individual, known or not, or a whole number.
+    /// Any individual, declared or not, or a whole number.
     Anything,
     /// A whole number.
     Integer,
-    /// An individual of this class or a subclass of it.
+    /// An individual of this class or of a subclass.
     Class(String),
 }
 
-/// What the value of a fact is. No value (null) is always allowed.
+/// The range of a fact's value. Null is always allowed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Range {
     /// A value of this type.
     Type(Type),
-    /// The name of an individual of this class or a subclass of it.
+    /// The name of an individual of this class or of a subclass.
     Class(String),
 }
 
-/// A fact that does not fit the ontology.
+/// A fact that does not conform to the ontology.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("[{rule}] {message}{}{help}", if .help.is_empty() { "" } else { "; " })]
 pub struct Violation {
     /// The rule's name, `outside-domain`.
     pub rule: &'static str,
-    /// What does not fit.
+    /// What is wrong.
     pub message: String,
-    /// What to do; empty where the message says it.
+    /// What to do; empty if the message already tells.
     pub help: String,
 }
 
@@ -105,7 +105,7 @@ impl Ontology {
         self.predicates.get(name)
     }
 
-    /// The individuals that are declared by name.
+    /// The declared individuals.
     pub fn individuals(&self) -> impl Iterator<Item = &str> {
         self.individuals.keys().map(String::as_str)
     }
@@ -115,13 +115,13 @@ impl Ontology {
         self.predicates.iter().map(|(name, predicate)| (name.as_str(), predicate))
     }
 
-    /// The predicates that the scene is derived from, with their arity.
+    /// The predicates from which the scene is derived, with their arity.
     pub fn scene(&self) -> Vec<(&str, usize)> {
         let geometric = self.predicates().filter(|(_, predicate)| predicate.geometric);
         geometric.map(|(name, predicate)| (name, predicate.domain.len())).collect()
     }
 
-    /// The tolerances of a task with what is said here of its predicates.
+    /// The tolerances of a task, completed by those of the predicates here.
     #[must_use]
     pub fn tolerances(&self, mut of_task: Tolerances) -> Tolerances {
         for (name, Predicate { tolerance, .. }) in self.predicates() {
@@ -133,7 +133,7 @@ impl Ontology {
         of_task
     }
 
-    /// The facts of which none may hold beside this one: those of a functional predicate about the same subject.
+    /// The facts that must not hold together with this one: other facts of a functional predicate for the same subject.
     pub fn rivals(&self, fact: &FactKey) -> Option<FactPattern> {
         self.predicate(&fact.predicate).filter(|predicate| predicate.functional)?;
         let mut rivals = FactPattern::of(fact);
@@ -141,15 +141,15 @@ impl Ontology {
         Some(rivals)
     }
 
-    /// Whether an individual is of a class: as declared or by its name, directly or over subclasses.
+    /// Whether an individual is of a class: as declared or by its name, directly or through subclasses.
     pub fn is_a(&self, individual: &str, class: &str) -> bool {
         self.classes_of(individual).any(|of| self.classes.get(of).is_some_and(|above| above.contains(class)))
     }
 
-    /// Whether such facts can be.
+    /// Checks a pattern of facts.
     ///
     /// # Errors
-    /// The rule that is broken.
+    /// The violated rule.
     pub fn check_pattern(&self, pattern: &FactPattern) -> Result<(), Violation> {
         let name = &pattern.predicate;
         let Some(predicate) = self.predicates.get(name) else {
@@ -179,17 +179,17 @@ impl Ontology {
         Ok(())
     }
 
-    /// Whether the fact can have the value.
+    /// Checks a fact with its value.
     ///
     /// # Errors
-    /// The rule that is broken, by the fact first.
+    /// The violated rule; those for the fact come first.
     pub fn check_fact(&self, fact: &FactKey, value: &Value) -> Result<(), Violation> {
         let pattern = FactPattern::of(fact);
         self.check_pattern(&pattern)?;
         self.check_value(&pattern, value)
     }
 
-    /// Whether facts that fit the pattern can have the value; a predicate that is not known can.
+    /// Checks a value for facts that match the pattern; for an undeclared predicate every value is allowed.
     ///
     /// # Errors
     /// `outside-range`.
@@ -214,10 +214,10 @@ impl Ontology {
         }
     }
 
-    /// Whether the world can change so.
+    /// Checks a change of the world.
     ///
     /// # Errors
-    /// The rule that the first change that does not fit breaks.
+    /// The first violated rule.
     pub fn check_change(&self, change: &Change) -> Result<(), Violation> {
         match change {
             Change::Set { fact, value } => self.check_fact(fact, value),
@@ -230,18 +230,18 @@ impl Ontology {
         }
     }
 
-    /// Whether facts that fit the pattern can grow by this much.
+    /// Checks an increase of facts that match the pattern.
     ///
     /// # Errors
     /// `outside-range`.
     pub fn check_increase(&self, pattern: &FactPattern, by: f64) -> Result<(), Violation> {
         let whole = by.fract() == 0.0 && by.abs() < i64::MAX as f64;
-        // A whole number added to an int leaves an int.
+        // An int plus a whole number stays an int.
         let step = if whole { Value::Int(by as i64) } else { Value::Float(by) };
         self.check_value(pattern, &step)
     }
 
-    /// Whether a fact with this value can have been measured so. A measurement may always leave open how sure it is.
+    /// Checks whether a fact with this value may have this measurement. A measurement may always omit its certainty.
     ///
     /// # Errors
     /// `other-uncertainty`.
@@ -276,10 +276,10 @@ impl Ontology {
         Err(Violation { rule: "other-uncertainty", message, help })
     }
 
-    /// As [`Ontology::check_change`], for all of them.
+    /// Checks several changes; see [`Ontology::check_change`].
     ///
     /// # Errors
-    /// As there.
+    /// The first violated rule.
     pub fn check_changes(&self, changes: &[Change]) -> Result<(), Violation> {
         changes.iter().try_for_each(|change| self.check_change(change))
     }
@@ -290,7 +290,7 @@ impl Ontology {
         declared.chain(named.map(|(_, class)| class)).map(String::as_str)
     }
 
-    /// Why an individual is not of a class; nothing where it is.
+    /// Reason why an individual is not of a class; empty if it is.
     fn is_not(&self, individual: &str, class: &str) -> Option<String> {
         if self.is_a(individual, class) {
             return None;
@@ -302,7 +302,7 @@ impl Ontology {
         })
     }
 
-    /// What to do about an individual that does not fit.
+    /// Advice about an individual that does not conform.
     fn near(&self, individual: &str) -> String {
         if self.classes_of(individual).next().is_some() {
             return String::new();
@@ -313,7 +313,7 @@ impl Ontology {
 }
 
 impl Violation {
-    /// Two facts of a functional predicate about one subject.
+    /// The violation by two facts of a functional predicate for one subject.
     pub fn not_functional(fact: &FactKey, beside: &FactKey) -> Violation {
         Violation {
             rule: "not-functional",

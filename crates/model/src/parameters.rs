@@ -1,4 +1,4 @@
-//! The values of a task's parameters for one run: as set, else their defaults.
+//! The values of a task's parameters in one run: those that are set, else the defaults.
 
 use crate::expression::Expr;
 use crate::expression::parse::{NameError, Names, parse_expression};
@@ -8,7 +8,7 @@ use crate::program::{Parameter, Program};
 use crate::value::{Type, Value};
 use std::collections::BTreeMap;
 
-/// Why parameters cannot be bound. Its rule is `invalid-parameter`.
+/// Error: parameters cannot be bound. Its rule is `invalid-parameter`.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ParameterError {
     /// The task declares no such parameter.
@@ -16,28 +16,28 @@ pub enum ParameterError {
     Unknown {
         /// The task.
         task: String,
-        /// What was set.
+        /// The unknown name.
         name: String,
-        /// What there is.
+        /// The parameters that exist.
         help: String,
     },
-    /// A text that is no value of the parameter's type.
+    /// The text is no value of the parameter's type.
     #[error("parameter `{name}` is {ty}; `{text}` is none")]
     NotOfItsType {
         /// The parameter.
         name: String,
         /// Its type.
         ty: Type,
-        /// What was given.
+        /// The text.
         text: String,
     },
-    /// Set twice.
+    /// The parameter was set twice.
     #[error("parameter `{name}` is set twice")]
     Twice {
         /// The parameter.
         name: String,
     },
-    /// Neither set nor with a default.
+    /// The parameter is neither set nor has it a default.
     #[error("task `{task}` needs parameter `{name}` ({ty}): set it with `--set {name}=…`")]
     Missing {
         /// The task.
@@ -54,7 +54,7 @@ impl Program {
     /// is written as in a task file: `3`, `true`, `pose(0, 0, 1)`, `[1, 2]`.
     ///
     /// # Errors
-    /// [`ParameterError`] names the parameter and what it wants.
+    /// [`ParameterError`] with the parameter and the expected value.
     pub fn bind_parameters(&self, set: &[(String, String)]) -> Result<BTreeMap<String, Value>, ParameterError> {
         let mut values = BTreeMap::new();
         for (name, text) in set {
@@ -79,10 +79,10 @@ impl Program {
     }
 }
 
-/// A value that is written as in a task file: `3`, `true`, `left`, `pose(0, 0, 1)`, `[1, 2]`.
+/// Parses a constant written as in a task file: `3`, `true`, `left`, `pose(0, 0, 1)`, `[1, 2]`.
 ///
 /// # Errors
-/// Why the text is none.
+/// Why the text is no constant.
 pub fn constant(text: &str) -> Result<Value, String> {
     let expression = parse_expression(text, &mut NoNames).map_err(|error| error.message)?;
     expression.evaluate(&NothingKnown).map_err(|error| error.to_string())
@@ -106,7 +106,7 @@ fn read(text: &str, parameter: &Parameter) -> Result<Value, ParameterError> {
     if parameter.ty.accepts(&value) { Ok(value) } else { Err(wrong()) }
 }
 
-/// In a constant, a word is the individual of that name, and nothing else has a name.
+/// Names in a constant: a word is the individual of that name; all other names are unknown.
 pub(crate) struct NoNames;
 
 impl Names for NoNames {

@@ -13,23 +13,23 @@ use crate::value::{Type, Value};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// The outcome of a state that did what it should.
+/// The outcome of a state that succeeded.
 pub const SUCCESS: &str = "success";
 /// The outcome of a state that failed.
 pub const ABORTED: &str = "aborted";
-/// The outcome of a state that was told to stop.
+/// The outcome of a state that was cancelled.
 pub const PREEMPTED: &str = "preempted";
-/// The outcome of a state of which a condition did not hold to its end ([`Annotations::holds`]).
+/// The outcome of a state whose `while` condition did not hold until its end ([`Annotations::holds`]).
 pub const VIOLATED: &str = "violated";
-/// The outcome of a goal that an emergency stop ended. It is `preempted` to a state whose action has none of this name.
+/// The outcome of a goal that an emergency stop ended. A state whose action does not have this outcome ends `preempted` instead.
 pub const STOPPED: &str = "stopped";
 
-/// Whether a state that ends so has failed: it has no outputs and assigns nothing.
+/// Whether this outcome is a failure: the state then has no outputs and assigns nothing.
 pub fn is_failure(outcome: &str) -> bool {
     matches!(outcome, ABORTED | PREEMPTED | VIOLATED)
 }
 
-/// The provider of what the executive does itself: it waits ([`crate::wait`]). No task file can name it.
+/// The provider of states in which the executive itself waits ([`crate::wait`]). No task file can name it.
 pub const CLOCK: &str = "(clock)";
 
 /// A loaded task program.
@@ -37,23 +37,23 @@ pub const CLOCK: &str = "(clock)";
 pub struct Program {
     /// The task's name.
     pub name: String,
-    /// At most this many instances are expanded on one logical branch.
+    /// Limit of the instances that are expanded on one logical branch.
     pub horizon: usize,
-    /// At most this many branches of undecided conditions are expanded, the likelier ones first.
+    /// Limit of the branches of undecided conditions that are expanded, the most likely ones first.
     pub speculation_width: usize,
-    /// The task ends `aborted` when it has taken this long, in the robot's seconds.
+    /// Deadline in the robot's seconds: the task then ends `aborted`.
     pub deadline_s: Option<f64>,
-    /// Whether states that do not say it fail precisely.
+    /// Default of `exceptions` for states that do not say it.
     pub exceptions: Exceptions,
-    /// What `--set` may give.
+    /// The parameters that `--set` may give.
     pub parameters: Vec<Parameter>,
     /// What the task returns when it ends with success.
     pub outputs: Vec<TaskOutput>,
     /// The facts that hold at the start, over what the world pool already holds; arguments may use parameters.
     pub initial: Vec<EffectExpr>,
-    /// When a measured value is the predicted one, as far as the task and its ontology say it.
+    /// Tolerances for measured values, as far as the task and its ontology give them.
     pub tolerances: Tolerances,
-    /// What its facts may say; `None`: anything.
+    /// The ontology of its facts; `None` allows all facts.
     pub ontology: Option<Ontology>,
     /// Every state; a [`StateId`] is an index. State 0 is the root, a [`StateKind::Sequence`].
     pub states: Vec<State>,
@@ -64,11 +64,11 @@ pub struct Program {
 /// A parameter of a task.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Parameter {
-    /// Used as `$name`.
+    /// Its name, used as `$name`.
     pub name: String,
-    /// What it accepts.
+    /// Its type.
     pub ty: Type,
-    /// What it is when not given; `None` makes it required.
+    /// Its default value; `None` makes it required.
     pub default: Option<Value>,
 }
 
@@ -94,34 +94,33 @@ pub struct State {
     pub path: String,
     /// The state that contains it; `None` for the root.
     pub parent: Option<StateId>,
-    /// What it is.
+    /// Its kind.
     pub kind: StateKind,
     /// Its outcomes beside `success`, `aborted` and `preempted`.
     pub outcomes: Vec<String>,
-    /// Where its outcomes lead; see [`Program::target`] for those that are not listed.
+    /// Targets of its outcomes; see [`Program::target`] for those that are not listed.
     pub transitions: BTreeMap<String, Target>,
-    /// Scoped variables of a sequence or a loop (a library's parameters are its scoped variables): bound at entry, each in the scope of
-    /// the state itself, seen and assigned by what it contains.
+    /// Scoped variables of a sequence or a loop (a library's parameters are its scoped variables). They are bound at entry, each in the scope of
+    /// the state itself; the states inside can read and assign them.
     pub variables: Vec<(String, Expr)>,
-    /// Scoped variables that it gives new values when it ends with an outcome that is neither `aborted` nor `preempted`,
-    /// evaluated where its effects are.
+    /// Assignments to scoped variables when it ends with an outcome that is no failure, evaluated in the same scope as its effects.
     pub assign: Vec<(String, Expr)>,
-    /// What its output ports are while it has not run in this activation of what contains it.
+    /// Default values of its output ports, used while it has not run in this activation of the state around it.
     pub defaults: BTreeMap<String, Value>,
-    /// What it depends on and changes.
+    /// What it depends on and what it changes.
     pub annotations: Annotations,
-    /// Where it stands in the task file.
+    /// Its location in the task file.
     pub location: Location,
 }
 
-/// Where an outcome leads.
+/// The target of an outcome.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Target {
-    /// To a state of the same list.
+    /// A state of the same list.
     State(StateId),
-    /// Out of the list, by this outcome. `success` of a loop's body is the end of an iteration; any other outcome of a body, a
-    /// branch or a list of children is the outcome of the state around it.
+    /// Leaves the list by this outcome. `success` of a loop's body ends an iteration; any other outcome of a body, a branch or a list of children
+    /// becomes the outcome of the state around it.
     Outcome(String),
 }
 
@@ -135,19 +134,19 @@ pub enum StateKind {
         provider: String,
         /// Its action.
         action: String,
-        /// Input ports and what flows into them.
+        /// Input ports and their expressions.
         inputs: Vec<(String, Expr)>,
         /// Output ports with their types.
         outputs: BTreeMap<String, Type>,
     },
-    /// A hierarchy: begins with its first child and goes on along their transitions.
+    /// A hierarchy: begins with its first child and follows the transitions.
     Sequence {
-        /// In program order; the first is where it begins. Without children it succeeds at once.
+        /// In program order; execution begins with the first. Without children it succeeds at once.
         children: Vec<StateId>,
         /// Output ports, evaluated in the scope of the children when the last has ended.
         outputs: Vec<TaskOutput>,
     },
-    /// The body once per element of a list that is known only at run time.
+    /// A loop over a list that is known only at run time.
     ForEach {
         /// The variable bound to the element.
         variable: String,
@@ -161,11 +160,11 @@ pub enum StateKind {
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         outputs: Vec<TaskOutput>,
     },
-    /// The body as long as a predicate holds.
+    /// A loop that repeats while a predicate holds.
     While {
         /// A boolean, evaluated before each iteration.
         predicate: Expr,
-        /// The first iteration begins without it: a `do … while`.
+        /// Whether the first iteration is not tested: `do … while`.
         body_first: bool,
         /// The variable bound to the number of the iteration (from 0), if wanted.
         index: Option<String>,
@@ -175,18 +174,17 @@ pub enum StateKind {
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         outputs: Vec<TaskOutput>,
     },
-    /// All regions at once. Each is a state with a path, a horizon and projections of its own; its outcome is seen as the port
-    /// `outcome` of the region.
+    /// Concurrent regions. Each region is a state with its own path, horizon and projections; its outcome is available as its port `outcome`.
     Concurrency {
-        /// The regions; their order means nothing.
+        /// The regions; their order has no meaning.
         regions: Vec<StateId>,
-        /// Regions that still go on when it ends are preempted: when the first has ended, whose outcome is the outcome, or with `successes`;
-        /// else all are waited for.
+        /// Whether regions that still run are preempted: when the first region ends, whose outcome becomes the outcome, or as `successes` says. If
+        /// false, all regions are waited for.
         preemptive: bool,
-        /// With `preemptive`: it ends when so many regions have succeeded, or so many can no longer succeed.
+        /// With `preemptive`: it ends when this number of regions have succeeded, or can no longer succeed.
         successes: Option<u32>,
-        /// The decider: the first outcome whose boolean holds. Where none does: `success` if all regions succeeded, `aborted` if
-        /// one aborted, else `preempted`.
+        /// The decider: the first outcome whose boolean holds. If none holds: `success` if all regions succeeded, `aborted` if one aborted, else
+        /// `preempted`.
         decide: Vec<(String, Expr)>,
         /// Output ports, evaluated in the scope of the regions when all have ended.
         outputs: Vec<TaskOutput>,
@@ -205,54 +203,54 @@ pub enum StateKind {
     },
 }
 
-/// What a state depends on and changes. The default is a PIA that reads and writes everything.
+/// What a state depends on and what it changes. The default is a PIA that reads and writes everything.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Annotations {
-    /// What it does to the environment.
+    /// Its effect on the environment.
     pub nature: Nature,
     /// The facts it reads; `None` is everything. Facts named in its inputs are included by the loader.
     pub reads: Option<Vec<FactExpr>>,
-    /// Booleans that must hold in the actual world when it starts.
+    /// Preconditions: booleans that must hold in the actual world when it starts.
     pub requires: Vec<Expr>,
-    /// Booleans that must hold in the actual world from its start to its end. Where one does not, an action is cancelled and ends
-    /// [`VIOLATED`]. Only PIAs have some; around any other state [`crate::guard`] puts a watch.
+    /// `while` conditions: booleans that must hold in the actual world from start to end. If one does not hold, the action is cancelled and ends
+    /// [`VIOLATED`]. Only PIAs have them; other states get a watch from [`crate::guard`].
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub holds: Vec<Expr>,
-    /// Per outcome what it changes. No entry for an outcome: it may write everything.
+    /// The effects of each outcome. An outcome without entry may write everything.
     pub effects: BTreeMap<String, Vec<EffectExpr>>,
     /// What it asks of the resource manager.
     pub resources: Vec<ResourceExpr>,
-    /// It and what it contains are executed as one node, by the sequential interpreter.
+    /// Routine: the sequential interpreter executes it with its parts as one node.
     pub routine: bool,
     /// Estimated duration in seconds of the robot's time.
     pub duration_s: Option<Expr>,
-    /// How often a computing or sensing node is tried when its worker dies; `None` is the executive's default.
+    /// Number of attempts of a computing or sensing node whose worker dies; `None` is the executive's default.
     pub attempts: Option<u32>,
-    /// Whether it is tried again when it ends `aborted`.
+    /// Retries after the outcome `aborted`.
     pub retry: Option<Retry>,
-    /// It ends `aborted` when its goal takes longer than this, in the robot's seconds.
+    /// Timeout of its goal in the robot's seconds; then it ends `aborted`.
     pub timeout_s: Option<f64>,
-    /// Whether younger PIAs may run beside it; `None` is what the task says.
+    /// Whether younger PIAs may run beside it; `None`: as the task says.
     pub exceptions: Option<Exceptions>,
-    /// Outcomes that are exceptional although they are connected: what follows them is not computed ahead.
+    /// Outcomes that are exceptional although they have a transition: what follows them is not computed ahead.
     pub exceptional: Vec<String>,
-    /// The same inputs and facts always give the same result, whatever the seed.
+    /// Whether equal inputs and facts always give the same result, whatever the seed.
     pub deterministic: bool,
-    /// Its action gives a result that can be used, and better ones later; any of them will do.
+    /// Anytime: its action gives a usable result first, and better ones later; any will do.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub anytime: bool,
-    /// On a region: facts that other regions may touch too. The programmer answers for their order.
+    /// For a region: facts that other regions may also change. The programmer is responsible for their order.
     pub shared: Vec<FactExpr>,
-    /// Who says what is in force, by key; keys that nobody says are left out. The block of a projection that nobody says is under [`WORLD_MODEL`].
+    /// Where the value of each key comes from; defaults are left out. An implied block of a projection is listed under [`WORLD_MODEL`].
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub origin: BTreeMap<String, Origin>,
-    /// That a sequence was made of a state that is tried again ([`crate::guard`]).
+    /// For the sequence that a state with `retry` became ([`crate::guard`]).
     pub again: Option<Again>,
-    /// That a sequence was made of a state with something to do on every way out.
+    /// For the sequence that a state with `finally` became.
     pub finally: Option<Finally>,
 }
 
-/// Who says what is in force under a key of a state.
+/// The origin of an annotation of a state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Origin {
@@ -260,36 +258,36 @@ pub enum Origin {
     State,
     /// Its action, in the catalogue.
     Action,
-    /// Both: effects add up.
+    /// Both: effects are combined.
     Both,
-    /// Neither: what reads facts ahead of its place needs a projection.
+    /// Implied: a state that reads facts ahead of its place needs a projection.
     Reads,
 }
 
-/// What a state became that is tried again. It is said once more what its transitions and variables come to.
+/// The result of expanding `retry`. It repeats what the sequence's transitions and variables already express.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Again {
-    /// What is tried.
+    /// The state that is tried.
     pub body: StateId,
-    /// How many tries after the first.
+    /// Number of tries after the first.
     pub count: u32,
-    /// The outcomes after which it is.
+    /// The outcomes after which it is tried again.
     pub on: Vec<String>,
-    /// What is done before each further try.
+    /// The state that is executed before each further try.
     pub before: Option<StateId>,
 }
 
-/// What a state became that has something to do on every way out.
+/// The result of expanding `finally`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Finally {
-    /// What was to be done.
+    /// The guarded state.
     pub body: StateId,
-    /// What is done behind it, by its outcome.
+    /// The copy of the `finally` block for each outcome of the body.
     pub lastly: BTreeMap<String, StateId>,
 }
 
 impl Annotations {
-    /// Every state that what a state became names.
+    /// Calls `visit` for every state id in `again` and `finally`.
     pub fn each_mark_mut(&mut self, visit: &mut dyn FnMut(&mut StateId)) {
         if let Some(again) = &mut self.again {
             visit(&mut again.body);
@@ -302,28 +300,27 @@ impl Annotations {
     }
 }
 
-/// How often and after which pauses an action that ends `aborted` is tried again. Only the last try's outcome, outputs and effects
-/// count; each try has a seed of its own.
+/// Retries of an action that ends `aborted`. Only the outcome, outputs and effects of the last try count; each try has its own seed.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Retry {
-    /// How many tries after the first.
+    /// Number of tries after the first.
     pub count: u32,
     /// The pause before the second try, in the robot's seconds; doubled before each further one.
     pub backoff_s: f64,
 }
 
-/// What younger PIAs do while a PIA runs.
+/// Whether younger PIAs may run beside a running PIA.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Exceptions {
-    /// They wait for its end: a failure leaves the world as the sequential program would.
+    /// They wait for its end: a failure leaves the same world as in the sequential program.
     #[default]
     Precise,
-    /// They may run beside it where nothing else forbids it: what they did stands even if it fails.
+    /// They may run beside it unless something else forbids it; their effects stay even if it fails.
     Imprecise,
 }
 
-/// What a state does to the environment.
+/// The effect of a state on the environment.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Nature {
@@ -332,40 +329,40 @@ pub enum Nature {
     Irreversible,
     /// Works on a projection; may be speculated, repeated, discarded.
     Computes,
-    /// Looks at the environment, which must show these facts as they are at its place in the program.
+    /// Senses the environment, which must show these facts as they are at the state's place in the program.
     Senses(Vec<FactExpr>),
 }
 
 /// One line of `resources`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ResourceExpr {
-    /// What is done with it.
+    /// The operation.
     pub operation: ResourceOperation,
     /// The kind, `PathPlanner`. The bare word `world_model` is written as a block of kind `WorldModel`.
     pub kind: String,
-    /// The class, where the task says it.
+    /// The class, if the task gives it.
     pub class: Option<ResourceClass>,
-    /// Attributes that it must have (for create: that it gets).
+    /// Required attributes (for create: the attributes that the new resource gets).
     pub attributes: Vec<(String, Expr)>,
-    /// What its attributes must be like besides.
+    /// Further conditions on attributes.
     pub conditions: Vec<ConditionExpr>,
-    /// How much; of what is not divisible, how many.
+    /// The amount; for indivisible resources the number of units.
     pub count: Quantity,
-    /// What it creates is divisible.
+    /// For create: whether the new resource is divisible.
     pub divisible: bool,
-    /// Of a resource that actuates: PIAs that block it need not do so in program order.
+    /// For a resource that actuates: whether PIAs that block it may run in any order.
     pub unordered: bool,
 }
 
 impl ResourceExpr {
-    /// One of a kind, whatever it is like.
+    /// One unit of a kind, with any attributes.
     pub fn new(operation: ResourceOperation, kind: impl Into<String>) -> ResourceExpr {
         let (class, attributes, conditions) = Default::default();
         let (count, divisible, unordered) = (Quantity::ONE, false, false);
         ResourceExpr { operation, kind: kind.into(), class, attributes, conditions, count, divisible, unordered }
     }
 
-    /// What it is selected by, or gets.
+    /// The expressions of its attributes and conditions.
     pub fn expressions(&self) -> impl Iterator<Item = &Expr> {
         let conditions = self.conditions.iter().map(|condition| &condition.value);
         self.attributes.iter().map(|(_, value)| value).chain(conditions)
@@ -380,7 +377,7 @@ impl ResourceExpr {
 /// The resource kind that stands for room for a projection.
 pub const WORLD_MODEL: &str = "WorldModel";
 
-/// A place in a task file, both from 1; 0:0 when unknown.
+/// A place in a task file, line and column counted from 1; 0:0 if unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
 pub struct Location {
     /// Line.
@@ -393,7 +390,7 @@ impl Program {
     /// The root state.
     pub const ROOT: StateId = StateId(0);
 
-    /// The branches expanded in a task that says nothing.
+    /// The default number of branches that are expanded.
     pub const DEFAULT_SPECULATION_WIDTH: usize = 8;
 
     /// The state of an id.
@@ -401,15 +398,15 @@ impl Program {
         &self.states[id.0 as usize]
     }
 
-    /// Whether a state is what the body of a loop stands in that collects something of each iteration ([`crate::guard::Collected`]). What is inside
-    /// of it is inside of the loop, as in any other loop: it is seen from there, and forgotten when the loop is entered.
+    /// Whether a state was put around the body of a loop that collects values ([`crate::guard::Collected`]). States inside of it count as being
+    /// directly inside of the loop: they are visible from there, and their outputs are removed when the loop is entered.
     pub fn is_pass(&self, id: StateId) -> bool {
         let state = self.state(id);
         let collects = |around: &State| around.is_loop() && !around.variables.is_empty();
         matches!(state.kind, StateKind::Sequence { .. }) && state.parent.is_some_and(|id| collects(self.state(id)))
     }
 
-    /// Whether the list of a state is gone through once in each iteration: that of a loop, or of what its body stands in.
+    /// Whether the list of a state is executed once per iteration: it is a loop, or the state around a loop's body ([`Program::is_pass`]).
     pub fn is_iterated(&self, id: StateId) -> bool {
         self.state(id).is_loop() || self.is_pass(id)
     }
@@ -423,7 +420,7 @@ impl Program {
         }
     }
 
-    /// The states that a loop goes through in each iteration.
+    /// The states that a loop executes in each iteration.
     pub fn body_of(&self, id: StateId) -> &[StateId] {
         let (StateKind::ForEach { body, .. } | StateKind::While { body, .. }) = &self.state(id).kind else {
             return &[];
@@ -434,8 +431,8 @@ impl Program {
         }
     }
 
-    /// Where an outcome of a state leads. An outcome that is not connected: `success` goes on with the next sibling, and after the
-    /// last one out by `success`; any other leaves by its own name. A region leads nowhere else.
+    /// The target of an outcome. Without a transition, `success` continues with the next sibling and leaves the list by `success` after the last
+    /// one; any other outcome leaves the list by its own name. A region always leaves.
     pub fn target(&self, id: StateId, outcome: &str) -> Target {
         let state = self.state(id);
         if let Some(target) = state.transitions.get(outcome) {
@@ -449,8 +446,8 @@ impl Program {
         next.map_or_else(|| Target::Outcome(SUCCESS.to_owned()), |next| Target::State(*next))
     }
 
-    /// Whether what follows an outcome is not computed ahead: `aborted`, `preempted` and `violated` unless they are connected to
-    /// something else than what follows success, and whatever is marked so.
+    /// Whether states behind this outcome are not computed ahead. This holds for `aborted`, `preempted` and `violated`, unless they have a target
+    /// other than that of `success`, and for outcomes marked as exceptional.
     pub fn is_exceptional(&self, id: StateId, outcome: &str) -> bool {
         let state = self.state(id);
         if state.annotations.exceptional.iter().any(|marked| marked == outcome) {
@@ -467,10 +464,10 @@ impl Program {
 }
 
 impl Program {
-    /// Every state's outcomes: `success`, its own, those by which what it contains leaves it, `aborted`, `preempted`.
+    /// The outcomes of every state: `success`, its own, those by which inner states leave it, `aborted`, `preempted`.
     pub fn all_outcomes(&self) -> Vec<Vec<String>> {
         let mut all: Vec<Vec<String>> = vec![Vec::new(); self.states.len()];
-        // What a state contains comes after it.
+        // Inner states have larger ids than the states around them.
         for state in self.states.iter().rev() {
             let mut own = vec![SUCCESS.to_owned()];
             let add = |own: &mut Vec<String>, name: &str| {
@@ -503,7 +500,7 @@ impl Program {
 }
 
 impl StateKind {
-    /// What it puts out of what it contains; none of an action.
+    /// Output ports with expressions; none for an action.
     pub fn outputs(&self) -> &[TaskOutput] {
         match self {
             StateKind::Action { .. } => &[],
@@ -515,7 +512,7 @@ impl StateKind {
         }
     }
 
-    /// The same, to change them; `None` of an action.
+    /// The same, mutable; `None` for an action.
     pub fn outputs_mut(&mut self) -> Option<&mut Vec<TaskOutput>> {
         match self {
             StateKind::Action { .. } => None,
@@ -529,12 +526,12 @@ impl StateKind {
 }
 
 impl State {
-    /// Whether it waits, which the executive does itself: no provider gets a goal.
+    /// Whether the executive itself waits in this state; no provider gets a goal.
     pub fn is_pause(&self) -> bool {
         matches!(&self.kind, StateKind::Action { provider, .. } if provider == CLOCK)
     }
 
-    /// Whether it is executed as one node although it contains others: what is marked so, and every preemptive concurrency.
+    /// Whether a composite state is executed as one node: it is marked as routine, or it is a preemptive concurrency.
     pub fn is_routine(&self) -> bool {
         match self.kind {
             StateKind::Action { .. } => false,
@@ -543,7 +540,7 @@ impl State {
         }
     }
 
-    /// What it puts out of what it contains; none of an action.
+    /// Output ports with expressions; none for an action.
     pub fn outputs(&self) -> &[TaskOutput] {
         self.kind.outputs()
     }

@@ -1,18 +1,18 @@
-//! What others wrote, as it is shown to a person: no character of it steers a terminal, or turns the direction of the text around it.
+//! Makes untrusted text safe to show: no character in it can control a terminal or change the direction of the text around it.
 
 use std::borrow::Cow;
 
-/// Control characters but the ends of lines and tabs are written out, `\u{1b}`, and so are those that turn the direction of a text.
+/// Escapes control characters (`\u{1b}`), except line ends and tabs, and characters that change the text direction.
 pub fn readable(text: &str) -> Cow<'_, str> {
     written_out(text, |character| steers(character) && !matches!(character, '\n' | '\t'))
 }
 
-/// As [`readable`], for what stands in a line: the ends of lines and tabs are written out, too.
+/// As [`readable`], for text within a line: line ends and tabs are escaped, too.
 pub fn in_line(text: &str) -> Cow<'_, str> {
     written_out(text, steers)
 }
 
-/// Whether whoever shows a text does something at this character instead of showing it.
+/// Whether a terminal acts on this character instead of showing it.
 fn steers(character: char) -> bool {
     let turns =
         matches!(character, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');

@@ -1,4 +1,4 @@
-//! What a state asks of the resource manager.
+//! The resource requirements of a state, and leases.
 
 mod quantity;
 
@@ -12,7 +12,7 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
 
-/// The five classes of the paper (III-C); the class says who may create a resource.
+/// The five resource classes of the paper (III-C). The class determines who may create a resource.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ResourceClass {
@@ -32,7 +32,7 @@ pub enum ResourceClass {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ResourceOperation {
-    /// Nobody else has it while the state runs.
+    /// Exclusive use while the state runs.
     Block,
     /// Used up for the rest of the task.
     Consume,
@@ -47,20 +47,20 @@ pub enum ResourceOperation {
 /// One line of a state's `resources`, with every expression evaluated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Requirement {
-    /// What is done with it.
+    /// The operation.
     pub operation: ResourceOperation,
     /// The kind of resource, `PathPlanner`.
     pub kind: String,
-    /// The class, where the task says it.
+    /// The class, if the task gives it.
     pub class: Option<ResourceClass>,
-    /// Attributes that it must have (for create: that it gets).
+    /// Required attributes (for create: the attributes that the new resource gets).
     pub attributes: BTreeMap<String, Value>,
-    /// How much of their capacity in all; of what is not divisible, how many.
+    /// The total amount; for indivisible resources the number of units.
     pub count: Quantity,
-    /// For create: whether parts of a unit of it can be had.
+    /// For create: whether fractions of a unit can be acquired.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub divisible: bool,
-    /// What its attributes must be like besides.
+    /// Further conditions on attributes.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub conditions: Vec<Condition>,
 }
@@ -106,7 +106,7 @@ impl fmt::Display for Requirement {
 }
 
 impl Requirement {
-    /// One of a kind, whatever it is like.
+    /// One unit of a kind, with any attributes.
     pub fn new(operation: ResourceOperation, kind: impl Into<String>) -> Requirement {
         let (class, attributes, conditions) = Default::default();
         Requirement {
@@ -120,19 +120,19 @@ impl Requirement {
         }
     }
 
-    /// Whether attributes are as it wants them; `of` gives the value of one.
+    /// Whether the attributes satisfy the requirement; `of` returns the value of an attribute.
     pub fn accepts<'a>(&self, of: impl Fn(&str) -> Option<Cow<'a, Value>>) -> bool {
         self.attributes.iter().all(|(name, want)| of(name).is_some_and(|have| equal(&have, want)))
             && self.conditions.iter().all(|c| of(&c.attribute).is_some_and(|have| c.holds(&have)))
     }
 }
 
-/// What an acquire was granted: every blocked resource of one node, under one lease.
+/// The grant of an acquire: all blocked resources of one node, under one lease.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Lease {
     /// Its id.
     pub id: crate::id::LeaseId,
-    /// Grows strictly over all leases of a resource manager; who does the work refuses an older one than it has seen.
+    /// Strictly increasing over all leases of a resource manager; a provider refuses a smaller token than it has seen.
     pub token: crate::id::FencingToken,
     /// The resources, in the order of the requirements.
     pub resources: Vec<LeasedResource>,
@@ -145,22 +145,22 @@ pub struct LeasedResource {
     pub id: String,
     /// Its kind.
     pub kind: String,
-    /// Where its action service is served (`http://127.0.0.1:4000` or `unix:/path`); empty where it performs nothing.
+    /// Address of its action service (`http://127.0.0.1:4000` or `unix:/path`); empty if it performs no actions.
     pub endpoint: String,
-    /// The kinds that its kind is a subclass of.
+    /// The superclasses of its kind.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub superclasses: Vec<String>,
 }
 
 impl LeasedResource {
-    /// Whether it is of this kind, or of a subclass of it.
+    /// Whether it is of this kind or of a subclass.
     pub fn is_a(&self, kind: &str) -> bool {
         self.kind == kind || self.superclasses.iter().any(|superclass| superclass == kind)
     }
 }
 
 impl Lease {
-    /// The first leased resource of a kind, or of a subclass of it.
+    /// The first leased resource of a kind or of a subclass.
     pub fn resource(&self, kind: &str) -> Option<&LeasedResource> {
         let exact = self.resources.iter().find(|r| r.kind == kind);
         exact.or_else(|| self.resources.iter().find(|r| r.is_a(kind)))

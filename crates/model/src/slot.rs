@@ -1,7 +1,7 @@
-//! Where the expressions of a state stand: one walk over all of them. Code that asks what a state reads, needs, uses or is typed
-//! as asks this walk and chooses by [`Slot`]; nobody else takes a state apart for its expressions.
+//! The places of expressions in a state, with one walk over all of them. Code that needs a state's expressions calls this walk
+//! and selects by [`Slot`]; no other code takes a state apart.
 //!
-//! The walk visits whole expressions; their parts are visited by [`Expr::visit`]. It comes in the order of [`Slot`]'s variants.
+//! The walk visits whole expressions, in the order of [`Slot`]'s variants; their parts are visited by [`Expr::visit`].
 
 use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::program::{Annotations, Nature, Program, State, StateKind};
@@ -15,33 +15,33 @@ pub enum Slot<'a> {
     Input(&'a str),
     /// The list of a loop.
     Collection,
-    /// What a loop looks at before each iteration.
+    /// The predicate of a loop.
     While,
-    /// What a condition looks at.
+    /// The predicate of a condition.
     Condition,
-    /// When a concurrency has this outcome.
+    /// The decider's boolean for this outcome of a concurrency.
     Decide(&'a str),
-    /// An output port of a state that contains others; of the root, an output of the task.
+    /// An output port of a composite state; of the root, an output of the task.
     Output(&'a str),
-    /// What a scoped variable is at the beginning.
+    /// The initial value of a scoped variable.
     Variable(&'a str),
-    /// What a variable is at the end.
+    /// The value assigned to a variable at the end.
     Assign(&'a str),
     /// A precondition, by its number.
     Requires(usize),
-    /// What must hold to the end, by its number.
+    /// A `while` condition, by its number.
     Holds(usize),
     /// The estimated duration.
     Duration,
-    /// An argument of a fact that it declares to read.
+    /// An argument of a fact in `reads`.
     Reads,
-    /// An argument of a fact that it senses.
+    /// An argument of a fact in `senses`.
     Senses,
-    /// An argument of a fact that a region shares with others.
+    /// An argument of a fact in `shared`.
     Shared,
     /// In an effect of this outcome: an argument of a fact, a value, or the list of a quantifier.
     Effect(&'a str),
-    /// An attribute or a condition of a resource: the number of its line, and what is done with it.
+    /// An attribute or a condition of a resource: the number of its line, and the operation.
     Resource(usize, ResourceOperation),
 }
 
@@ -179,7 +179,7 @@ macro_rules! walk_effect {
 }
 
 impl Program {
-    /// Every expression of a state with its place; those of the root with the outputs of the task.
+    /// Every expression of a state with its place; for the root including the outputs of the task.
     pub fn expressions<'a>(&'a self, state: &'a State) -> Vec<(Slot<'a>, &'a Expr)> {
         let mut all = state.expressions();
         if state.id == Program::ROOT {
@@ -219,7 +219,7 @@ impl EffectExpr {
         walk_effect!(self, visit, mut);
     }
 
-    /// The facts that the effect writes, those of a quantifier included.
+    /// The facts that the effect writes, including those of a quantifier.
     pub fn written(&self) -> Vec<&FactExpr> {
         match self {
             EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => vec![fact],

@@ -1,4 +1,4 @@
-//! Time as the cores see it: an argument, never a clock.
+//! Time in the cores: an argument, never a clock.
 
 use serde::{Deserialize, Serialize};
 use std::time::Duration;
@@ -10,7 +10,7 @@ use std::time::Duration;
 pub struct Timestamp(pub u64);
 
 impl Timestamp {
-    /// The moment `seconds` after the start; negative and NaN count as the start.
+    /// The moment `seconds` after the start; negative values and NaN count as 0.
     pub fn from_seconds(seconds: f64) -> Self {
         Timestamp((seconds.max(0.0) * 1e9).round() as u64)
     }
@@ -20,7 +20,7 @@ impl Timestamp {
         self.0 as f64 / 1e9
     }
 
-    /// The time from `earlier` to here; zero if `earlier` is later.
+    /// The time since `earlier`; zero if `earlier` is later.
     pub fn since(self, earlier: Timestamp) -> Duration {
         Duration::from_nanos(self.0.saturating_sub(earlier.0))
     }

@@ -1,14 +1,14 @@
-//! When two values of a fact are the same fact: measured poses and numbers never match to the last bit.
+//! Tolerances: when two values of a fact count as the same, because measured poses and numbers are never exactly equal.
 //!
-//! A [`Tolerance`] is complete. A task and its ontology say parts of one ([`Deviation`]), for all facts or for those of a
-//! predicate; [`Tolerances::of`] puts them together, the nearest first: the task for the predicate, the ontology for the
-//! predicate, the task for all, in every run.
+//! A [`Tolerance`] is complete. Task and ontology give parts of one ([`Deviation`]), for all facts or for one predicate.
+//! [`Tolerances::of`] combines them with this precedence: the task for the predicate, the ontology for the predicate, the
+//! task for all, the default of the run.
 
 use crate::value::Value;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// How far a measured value may be from the predicted one and still be equal to it.
+/// The largest difference between a predicted and a measured value that count as the same.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tolerance {
@@ -20,7 +20,7 @@ pub struct Tolerance {
     pub number: f64,
 }
 
-/// A part of a [`Tolerance`]: what is `None` is said elsewhere.
+/// A part of a [`Tolerance`]: what is `None` is given elsewhere.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Deviation {
@@ -42,9 +42,9 @@ pub struct Tolerances {
 }
 
 impl Tolerance {
-    /// Equal means equal.
+    /// No tolerance.
     pub const EXACT: Tolerance = Tolerance { position_m: 0.0, angle_rad: 0.0, number: 0.0 };
-    /// What a gripper with compliant fingers forgives.
+    /// The differences that a gripper with compliant fingers can absorb.
     pub const ROBOT: Tolerance = Tolerance { position_m: 0.015, angle_rad: 0.09, number: 0.01 };
 
     /// Whether the two values are the same within the tolerance.
@@ -68,12 +68,12 @@ impl Tolerance {
 }
 
 impl Deviation {
-    /// Whether it says nothing.
+    /// Whether all parts are `None`.
     pub fn is_empty(&self) -> bool {
         *self == Deviation::default()
     }
 
-    /// What this one does not say as `further` says it.
+    /// Fills the missing parts from `further`.
     #[must_use]
     pub fn or(self, further: Deviation) -> Deviation {
         Deviation {
@@ -93,7 +93,7 @@ impl Deviation {
 }
 
 impl Tolerances {
-    /// The tolerance of a predicate's facts, over what holds where nothing is said.
+    /// The tolerance of a predicate's facts; `base` gives the parts that are not set.
     pub fn of(&self, predicate: &str, base: Tolerance) -> Tolerance {
         let own = self.predicates.get(predicate).copied().unwrap_or_default();
         own.or(self.default).over(base)

@@ -1,4 +1,4 @@
-//! Values that flow between states and stand in facts, and their types.
+//! Values of ports, variables and facts, and their types.
 
 use crate::list::List;
 use crate::pose::Pose;
@@ -17,7 +17,7 @@ pub enum Value {
     Bool(bool),
     /// A whole number.
     Int(i64),
-    /// A number; its unit is said by the port's name.
+    /// A number; the port's name tells its unit.
     Float(f64),
     /// Text, or the name of an individual.
     String(String),
@@ -31,7 +31,7 @@ pub enum Value {
     List(List),
     /// Named fields.
     Map(BTreeMap<String, Value>),
-    /// Bytes that only their producer and consumer understand.
+    /// Bytes that only their producer and consumer can interpret.
     Bytes(Vec<u8>),
 }
 
@@ -40,7 +40,7 @@ pub enum Value {
 pub struct Trajectory {
     /// Joint names, the order of every `positions`.
     pub joints: Vec<String>,
-    /// At least one point, times strictly growing from 0.
+    /// At least one point; times increase strictly from 0.
     pub points: Vec<TrajectoryPoint>,
 }
 
@@ -93,7 +93,7 @@ pub enum Type {
 }
 
 impl Value {
-    /// What kind of value this is, in the words of the type grammar.
+    /// The kind of this value, in the words of the type grammar.
     pub fn type_name(&self) -> &'static str {
         match self {
             Value::Null => "null",
@@ -119,7 +119,7 @@ impl Value {
         }
     }
 
-    /// An order of all values, whatever they are: kinds in the order of [`Value`] (but numbers among numbers), then content.
+    /// A total order of all values: by kind in the order of [`Value`] (ints and floats together as numbers), then by content.
     pub fn total_order(&self, other: &Value) -> Ordering {
         let kind = |value: &Value| match value {
             Value::Null => 0,
@@ -166,7 +166,7 @@ impl Value {
                 differing.next().unwrap_or(a.len().cmp(&b.len()))
             }
             (a, b) => match (a.as_number(), b.as_number()) {
-                // An int and a float that are one number are still told apart.
+                // An int and a float of the same value are still different.
                 (Some(x), Some(y)) => {
                     x.total_cmp(&y).then_with(|| matches!(a, Value::Float(_)).cmp(&matches!(b, Value::Float(_))))
                 }
@@ -190,7 +190,7 @@ impl Value {
 }
 
 impl Type {
-    /// Whether `value` fits.
+    /// Whether `value` is of this type.
     pub fn accepts(&self, value: &Value) -> bool {
         match (self, value) {
             (Type::Any, _) => true,
@@ -262,11 +262,11 @@ impl From<Type> for String {
     "`{text}` is not a type: expected any, bool, int, float, string, pose, joints, trajectory, bytes, list<T>, map<T> or {{field: T}}"
 )]
 pub struct UnknownType {
-    /// What was written.
+    /// The text.
     pub text: String,
 }
 
-/// How deep types may nest.
+/// Limit of the nesting of types.
 const MAX_TYPE_DEPTH: usize = 16;
 
 impl TryFrom<String> for Type {
@@ -381,8 +381,8 @@ impl fmt::Display for Value {
     }
 }
 
-/// A number with so many digits behind the point, or all that it has; one of more than sixteen before or many zeros behind the point has an
-/// exponent.
+/// A number with this many decimals, or with all that it has. Above sixteen digits before the point, or with many zeros behind it, it has
+/// an exponent.
 fn float(f: &mut fmt::Formatter<'_>, number: f64, digits: Option<usize>) -> fmt::Result {
     match digits {
         _ if number.is_finite() && number.abs() >= 1e16 => write!(f, "{number:e}"),

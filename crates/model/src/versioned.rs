@@ -1,11 +1,11 @@
-//! Values as bytes that are kept: the version of their form first, then [postcard](https://docs.rs/postcard).
+//! Values as bytes for storage: first the version of their format, then [postcard](https://docs.rs/postcard).
 //!
-//! For what is written into a log or a snapshot and read by later versions of the program. What changes in a form otherwise than by
-//! new variants of an enum at its end takes a new number, and readers still read the older ones ([`version`]).
+//! For records that later versions of the program read from a log or a snapshot. A format that changes otherwise than by new enum
+//! variants at its end gets a new version number, and readers still read the older ones ([`version`]).
 
 use serde::{Deserialize, Serialize};
 
-/// Bytes that are not what is expected, or of a version that is not known here.
+/// Error: the bytes have another content or an unknown version.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DecodeError {
     /// Written by another version.
@@ -13,30 +13,30 @@ pub enum DecodeError {
         "format {found} of the {of} is not known (this program reads up to {known}): use the version that wrote it"
     )]
     Version {
-        /// Of what.
+        /// The kind of record.
         of: &'static str,
         /// The first byte.
         found: u8,
-        /// The newest that is known.
+        /// The newest known version.
         known: u8,
     },
-    /// Not what [`encode`] writes.
+    /// The bytes were not written by [`encode`].
     #[error("these are no {of}: {reason}")]
     Broken {
-        /// What was expected.
+        /// The expected kind of record.
         of: &'static str,
         /// What is wrong.
         reason: String,
     },
 }
 
-/// A value as bytes, of a version.
+/// Serializes a value, with its version.
 pub fn encode<T: Serialize + ?Sized>(version: u8, value: &T) -> Vec<u8> {
-    // What is kept is made for it: no maps of unknown length, no foreign types, so nothing in it can fail to serialise.
+    // Stored types are our own and contain no maps of unknown length, so serialization cannot fail.
     postcard::to_extend(value, vec![version]).unwrap_or_default()
 }
 
-/// The version that bytes say they are of, where it is one from `oldest` to `newest`; `of` says what they are, for the message.
+/// Checks that the bytes have a version from `oldest` to `newest` and returns it; `of` names the kind of record, for the message.
 ///
 /// # Errors
 /// No bytes, or another version.
@@ -48,10 +48,10 @@ pub fn version(oldest: u8, newest: u8, of: &'static str, bytes: &[u8]) -> Result
     }
 }
 
-/// Reads what [`encode`] wrote; `of` says what it is, for the message.
+/// Deserializes bytes written by [`encode`]; `of` names the kind of record, for the message.
 ///
 /// # Errors
-/// Bytes that it did not write, or another version did.
+/// The bytes were not written by `encode`, or have another version.
 pub fn decode<T: for<'a> Deserialize<'a>>(version: u8, of: &'static str, bytes: &[u8]) -> Result<T, DecodeError> {
     let broken = |reason: String| DecodeError::Broken { of, reason };
     let (found, rest) = bytes.split_first().ok_or_else(|| broken("no bytes".to_owned()))?;

@@ -1,46 +1,46 @@
 //! States that wait: for a time, for a condition on the world, for a signal that a client sends, for an operator's answer.
 //!
-//! The executive waits itself, so such a state is an action of the provider [`CLOCK`], which no task file can name. It is a PIA that
-//! changes nothing and holds nothing: it begins at its place in the program, and younger states are computed ahead meanwhile.
+//! The executive itself waits, so such a state is an action of the provider [`CLOCK`], which no task file can name. It is a PIA that changes nothing and holds
+//! no resources: it begins at its place in the program, and younger states are computed ahead meanwhile.
 //!
 //! | action | inputs | ends |
 //! |---|---|---|
-//! | [`PAUSE`], [`SECONDS`] | `seconds` | `success`, so much later |
-//! | [`UNTIL`] | `until` | `success`, when the run is so old |
-//! | [`CONDITION`] | `for` | `success`, when that holds in the actual world |
+//! | [`PAUSE`], [`SECONDS`] | `seconds` | `success`, after that time |
+//! | [`UNTIL`] | `until` | `success`, at that time since the start of the run |
+//! | [`CONDITION`] | `for` | `success`, when the condition holds in the actual world |
 //! | [`SIGNAL`] | `signal` | `success`, with the output `value`: each signal ends one wait |
-//! | [`ASK`] | `question`, `choices`, `default` | by the choice where that is an outcome of the state, else `success`, with the output `answer` |
-//! | [`WATCH`] | `for`, once or more | `violated`, when one of these does not hold in the actual world |
-//! | [`LIMIT`] | `seconds` | `aborted`, so much later |
+//! | [`ASK`] | `question`, `choices`, `default` | by the choice if it is an outcome of the state, else `success`, with the output `answer` |
+//! | [`WATCH`] | `for`, once or more | `violated`, when one of the conditions does not hold in the actual world |
+//! | [`LIMIT`] | `seconds` | `aborted`, after that time |
 //!
-//! Those for a condition, a signal and an answer may have a timeout ([`crate::program::Annotations::timeout_s`]): then they end by [`TIMEOUT`], a question with a
-//! default by that.
+//! Waits for a condition, a signal and an answer may have a timeout ([`crate::program::Annotations::timeout_s`]): then they end by [`TIMEOUT`], and a question
+//! with a default ends by its default.
 
 use crate::expression::{BinaryOperator, EffectExpr, Expr, FactExpr, UnaryOperator};
 use crate::program::{CLOCK, State, StateKind};
 use crate::value::Value;
 
-/// A pause that the loader has put between two tries.
+/// The backoff that the loader puts between two tries.
 pub const PAUSE: &str = "wait";
-/// So many seconds.
+/// Waits for some seconds.
 pub const SECONDS: &str = "seconds";
-/// Until the run is so many seconds old.
+/// Waits until a time since the start of the run.
 pub const UNTIL: &str = "until";
-/// Until a condition holds.
+/// Waits until a condition holds.
 pub const CONDITION: &str = "condition";
-/// Until a client sends a signal.
+/// Waits until a client sends a signal.
 pub const SIGNAL: &str = "signal";
-/// Until an operator answers.
+/// Waits until an operator answers.
 pub const ASK: &str = "ask";
 
-/// Until a condition of the state beside it does not hold ([`crate::guard`]).
+/// Watches until a `while` condition of the state beside it does not hold ([`crate::guard`]).
 pub const WATCH: &str = "watch";
-/// Until the state beside it has had its time ([`crate::guard`]).
+/// Waits until the state beside it has reached its timeout ([`crate::guard`]).
 pub const LIMIT: &str = "limit";
 
-/// The outcome of a wait that took too long.
+/// The outcome of a wait that reached its timeout.
 pub const TIMEOUT: &str = "timeout";
-/// The output of a wait for a signal: what was sent with it, null where nothing was.
+/// The output of a wait for a signal: the value sent with it, else null.
 pub const VALUE: &str = "value";
 /// The output of a question: the choice.
 pub const ANSWER: &str = "answer";
@@ -48,19 +48,19 @@ pub const ANSWER: &str = "answer";
 /// What a state waits for.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Wait<'s> {
-    /// So many seconds of the robot's time.
+    /// A duration in seconds of the robot's time.
     Seconds(&'s Expr),
-    /// Until the run is so many seconds of the robot's time old.
+    /// A time since the start of the run, in seconds of the robot's time.
     Until(&'s Expr),
     /// A condition on the actual world.
     Condition(&'s Expr),
-    /// Until one of these does not hold in the actual world.
+    /// The first of these conditions that does not hold in the actual world.
     Watch(Vec<&'s Expr>),
-    /// So many seconds, which are the limit of another state.
+    /// The timeout of another state, in seconds.
     Limit(&'s Expr),
     /// The next signal of this name.
     Signal(&'s str),
-    /// An answer.
+    /// An operator's answer.
     Answer(Question<'s>),
 }
 
@@ -69,14 +69,14 @@ pub enum Wait<'s> {
 pub struct Question<'s> {
     /// Evaluated to a text.
     pub text: &'s Expr,
-    /// What may be answered.
+    /// The possible answers.
     pub choices: Vec<&'s str>,
-    /// The answer when nobody has answered in time.
+    /// The answer if nobody answers in time.
     pub default: Option<&'s str>,
 }
 
 impl State {
-    /// What it waits for; `None` where it does something else.
+    /// What the state waits for; `None` if it does something else.
     pub fn wait(&self) -> Option<Wait<'_>> {
         let StateKind::Action { provider, action, inputs, .. } = &self.kind else { return None };
         if provider != CLOCK {
@@ -99,25 +99,24 @@ impl State {
         })
     }
 
-    /// Whether it was put into the program beside what is written there, so that nothing is said of it: a pause between two tries, or a
-    /// watch over another state.
+    /// Whether the loader has inserted it, so that it is not reported to users: a backoff between two tries, or a watch over another state.
     pub fn is_unsaid(&self) -> bool {
         matches!(&self.kind, StateKind::Action { provider, action, .. }
             if provider == CLOCK && [PAUSE, WATCH, LIMIT].contains(&action.as_str()))
     }
 
-    /// Whether it watches another state: a condition of that, or its time.
+    /// Whether it watches another state: its `while` conditions or its timeout.
     pub fn is_watch(&self) -> bool {
         matches!(self.wait(), Some(Wait::Watch(_) | Wait::Limit(_)))
     }
 
-    /// Whether it is a pause between two tries.
+    /// Whether it is the backoff between two tries.
     pub fn is_between_tries(&self) -> bool {
         matches!(&self.kind, StateKind::Action { provider, action, .. } if provider == CLOCK && action == PAUSE)
     }
 }
 
-/// The facts that a condition says outright: as they will be when it holds. What younger states are computed on meanwhile.
+/// The facts that a condition states literally, with the values that make it true. Younger states are computed ahead on them.
 pub fn foreseen(condition: &Expr) -> Vec<EffectExpr> {
     let mut all = Vec::new();
     foresee(condition, true, &mut all);
@@ -134,7 +133,7 @@ fn foresee(condition: &Expr, holds: bool, into: &mut Vec<EffectExpr>) {
         Expr::Fact(fact) if holds && is_one(fact) => {
             into.push(EffectExpr::Set(fact.clone(), Expr::Literal(Value::Bool(true))));
         }
-        // `not p(a)` holds of an absent fact and of one that is false; the former is what effects say.
+        // `not p(a)` is true if the fact is absent or false; the effect assumes that it is absent.
         Expr::Fact(fact) | Expr::Exists(fact) if !holds && is_one(fact) => into.push(EffectExpr::Delete(fact.clone())),
         Expr::Binary(BinaryOperator::Equal, a, b) if holds => match (&**a, &**b) {
             (Expr::Fact(fact), value) | (value, Expr::Fact(fact)) if is_one(fact) && looks_up_nothing(value) => {
@@ -146,7 +145,7 @@ fn foresee(condition: &Expr, holds: bool, into: &mut Vec<EffectExpr>) {
     }
 }
 
-/// Whether it is one fact, whose arguments look up no others.
+/// Whether it is a single fact whose arguments look up no other facts.
 fn is_one(fact: &FactExpr) -> bool {
     fact.arguments.iter().all(|argument| argument.as_ref().is_some_and(looks_up_nothing))
 }

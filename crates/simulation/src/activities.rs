@@ -1,7 +1,7 @@
-//! Activities that need resources and wait for each other, as a task: what the scheduling problems of the literature are made of.
+//! Activities with resource demands and precedences, as a task: the scheduling problems of the literature.
 //!
-//! Every activity is a node that blocks its resources for its whole duration and takes an output of each activity that it waits for. How well
-//! CDTN mode interleaves them is a measure of its dispatch and its look-ahead, on problems that nobody here has made.
+//! Every activity is a node that blocks its resources for its whole duration and takes an output of each of its predecessors. How well CDTN
+//! mode interleaves them measures its dispatch and its look-ahead, on problems from outside this project.
 
 use crate::dice::Dice;
 use crate::run::{Answer, Oracle, Performance, Run, RunError, Setup, run_looking_ahead};
@@ -20,7 +20,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Schedules that are looked at whenever much has changed, unless told otherwise.
+/// Default number of schedules that look-ahead tries whenever much has changed.
 pub const DEFAULT_ORDERS: usize = 30_000;
 
 /// An activity.
@@ -28,33 +28,33 @@ pub const DEFAULT_ORDERS: usize = 30_000;
 pub struct Activity {
     /// Its name in the task.
     pub name: String,
-    /// How long it is estimated to take, in seconds.
+    /// Its estimated duration, in seconds.
     pub duration_s: f64,
-    /// What it needs: the number of the kind, and how many units.
+    /// Its demands: the number of the kind, and the number of units.
     pub demands: Vec<(usize, u32)>,
-    /// Which it waits for, by their numbers, which are smaller than its own.
+    /// Its predecessors, by their numbers, which are smaller than its own.
     pub after: Vec<usize>,
 }
 
 /// A scheduling problem.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Activities {
-    /// The kinds of resources: how each is called, and how many units there are.
+    /// The kinds of resources: name and number of units.
     pub kinds: Vec<(String, u32)>,
-    /// In an order in which each comes after those it waits for.
+    /// The activities, each after its predecessors.
     pub activities: Vec<Activity>,
 }
 
-/// How a problem is executed.
+/// Options for executing a problem.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Execution {
-    /// Schedules that are looked at whenever much has changed; none is plain dispatch.
+    /// Number of schedules that look-ahead tries whenever much has changed; 0 is plain dispatch.
     pub orders: usize,
-    /// Random choices are derived from it.
+    /// The random seed.
     pub seed: u64,
-    /// What activities really take differs from the estimates by up to this share of them, at random by the seed.
+    /// Actual durations differ from the estimates by up to this share, at random by the seed.
     pub vary: f64,
-    /// Whether the executive knows what they really take.
+    /// Whether the executive knows the actual durations.
     pub is_clairvoyant: bool,
 }
 
@@ -98,7 +98,7 @@ impl Activities {
         }
         Program {
             name: "activities".to_owned(),
-            // All of it is in the window.
+            // The window holds the whole problem.
             horizon: self.activities.len() + 1,
             speculation_width: Program::DEFAULT_SPECULATION_WIDTH,
             deadline_s: None,
@@ -138,7 +138,7 @@ impl Activities {
         run_looking_ahead(setup, &mut Performers { durations_s }, execution.orders)
     }
 
-    /// No schedule of it is shorter: the longest path, and what each kind has to do.
+    /// Lower bound of the makespan: by the longest path, and by the work of each kind.
     pub fn lower_bound_s(&self) -> f64 {
         let mut ends = Vec::with_capacity(self.activities.len());
         let mut work = vec![0.0; self.kinds.len()];
@@ -153,7 +153,7 @@ impl Activities {
         loads.chain(ends.iter().copied()).fold(0.0, f64::max)
     }
 
-    /// The problem with what its activities really take.
+    /// The problem with the actual durations.
     fn varied(&self, execution: Execution) -> Activities {
         let mut actual = self.clone();
         let mut dice = Dice(execution.seed);
@@ -181,7 +181,7 @@ fn state(id: u64, name: &str, parent: Option<StateId>, kind: StateKind) -> State
     }
 }
 
-/// Whoever performs an activity takes as long as it really takes.
+/// The providers, which take the actual durations.
 struct Performers {
     durations_s: BTreeMap<String, f64>,
 }

@@ -19,7 +19,7 @@ impl Dice {
         self.roll() % bound.max(1)
     }
 
-    /// From 0 up to, not including, 1.
+    /// A number from 0 up to, not including, 1.
     pub fn share(&mut self) -> f64 {
         (self.roll() >> 11) as f64 / (1_u64 << 53) as f64
     }
@@ -29,7 +29,7 @@ impl Dice {
         self.below(100) < chance
     }
 
-    /// One of several; `None` of none.
+    /// One of several; `None` if there are none.
     pub fn one_of<'a, T>(&mut self, all: &'a [T]) -> Option<&'a T> {
         let at = self.below(all.len() as u64) as usize;
         all.get(at)
@@ -39,7 +39,7 @@ impl Dice {
 /// A hash of texts and numbers (FNV-1a).
 #[derive(Debug, Clone)]
 pub struct Hash(
-    /// What it begins with, and what it has come to.
+    /// Its initial value, later its present value.
     pub u64,
 );
 
@@ -58,7 +58,7 @@ impl Hash {
         }
     }
 
-    /// Dice that follow from all that was added.
+    /// Dice seeded with everything added so far.
     pub fn dice(&self) -> Dice {
         Dice(self.0)
     }

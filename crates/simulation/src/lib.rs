@@ -1,8 +1,8 @@
 //! All cores together in virtual time: the executive, the resource pool and the world, with providers that answer after as
-//! many virtual seconds as an [`run::Oracle`] says.
+//! many virtual seconds as an [`run::Oracle`] decides.
 //!
-//! Nothing here waits, opens a socket or reads a clock: the same program, oracle and seed give the same run to the last
-//! event. [`tables`] replays the paper's tables this way; the property tests compare the two modes.
+//! Nothing here waits, opens a socket or reads a clock: the same program, oracle and seed give exactly the same events.
+//! [`tables`] replays the paper's tables in this way; the property tests compare the two modes.
 
 pub mod activities;
 pub mod dice;

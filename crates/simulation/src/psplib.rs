@@ -1,23 +1,23 @@
 //! The `.sm` format of PSPLIB, the public library of project scheduling problems (Kolisch, Sprecher: PSPLIB – a project scheduling
 //! problem library, 1996): activities with one mode that need units of renewable resources.
 //!
-//! Read are the number of jobs and of resources, and the sections `PRECEDENCE RELATIONS`, `REQUESTS/DURATIONS` and
-//! `RESOURCEAVAILABILITIES`. What the format has besides (several modes, resources that are used up) is refused, not ignored.
+//! It reads the numbers of jobs and of resources, and the sections `PRECEDENCE RELATIONS`, `REQUESTS/DURATIONS` and
+//! `RESOURCEAVAILABILITIES`. Other features of the format (several modes, nonrenewable resources) are refused, not ignored.
 
 use crate::activities::{Activities, Activity};
 
-/// No file has more jobs, the source and the sink included.
+/// Limit of jobs in a file, including source and sink.
 pub const MAX_JOBS: usize = 10_000;
-/// No file has more kinds of resources.
+/// Limit of resource kinds in a file.
 pub const MAX_RESOURCES: usize = 100;
-/// Of no kind there are more units, and nothing takes longer.
+/// Limit of the units of a kind, and of a duration.
 pub const MAX_NUMBER: u32 = 1_000_000;
 
-/// A text that is no project.
+/// Error: the text is no project.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("line {line}: {problem}")]
 pub struct InvalidProject {
-    /// Which line, from 1.
+    /// The line, counted from 1.
     pub line: usize,
     /// What is wrong, and what is expected.
     pub problem: String,
@@ -27,7 +27,7 @@ fn wrong(line: usize, problem: impl Into<String>) -> InvalidProject {
     InvalidProject { line, problem: problem.into() }
 }
 
-/// Reads a project; its activities come in an order in which each comes after those it waits for.
+/// Parses a project; its activities are ordered, each after its predecessors.
 ///
 /// # Errors
 /// [`InvalidProject`] names the first line that does not fit.
@@ -58,10 +58,10 @@ pub fn parse(text: &str) -> Result<Activities, InvalidProject> {
     Ok(Activities { kinds, activities: activities(&order, &behind, &requests) })
 }
 
-/// What a job is followed by, and where that is said.
+/// The successors of a job, and the line that gives them.
 struct Precedence {
     line: usize,
-    /// From 0.
+    /// Job numbers, counted from 0.
     behind: Vec<usize>,
 }
 
@@ -76,7 +76,7 @@ struct Lines<'a> {
 }
 
 impl Lines<'_> {
-    /// The number behind the colon of the line that begins so.
+    /// The number behind the colon in the line that begins with `title`.
     fn count(&self, title: &str) -> Result<(usize, u32), InvalidProject> {
         let found = self.lines.iter().position(|line| line.starts_with(title));
         let Some(at) = found else {
@@ -96,7 +96,7 @@ impl Lines<'_> {
         Ok(count)
     }
 
-    /// The numbers of so many lines of a section, after its heading and so many lines more.
+    /// The numbers in `count` lines of a section, after its title and `headings` further lines.
     fn rows(&self, title: &str, headings: usize, count: usize) -> Result<Vec<(usize, Vec<u32>)>, InvalidProject> {
         let Some(at) = self.lines.iter().position(|line| line.starts_with(title)) else {
             return Err(wrong(self.lines.len().max(1), format!("there is no section `{title}`")));
@@ -188,7 +188,7 @@ fn number(line: usize, word: &str) -> Result<u32, InvalidProject> {
     number.ok_or_else(|| wrong(line, format!("`{word}` is no number from 0 to {MAX_NUMBER}")))
 }
 
-/// The jobs, each after those it waits for.
+/// The jobs, each after its predecessors.
 fn in_order(precedences: &[Precedence]) -> Result<Vec<usize>, InvalidProject> {
     let mut open = vec![0_usize; precedences.len()];
     for job in precedences.iter().flat_map(|precedence| &precedence.behind) {

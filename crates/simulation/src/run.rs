@@ -28,38 +28,37 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// So many facts of the executive's mirror are compared with the root's at each revision.
+/// Number of facts of the executive's mirror that are compared with the root at each revision.
 const COMPARED_FACTS: usize = 256;
 
-/// When something took another time than was planned with, this part of the orders is looked at.
+/// When a duration differed from its estimate, a short look-ahead tries this fraction (1/10) of the orders.
 const GLANCE_PART: usize = 10;
 
-/// The log of a run has so many lines per event that it may have at the most: one event may expand thousands of states that do nothing, again
-/// and again …
+/// Limit of log lines per allowed event, because one event may expand thousands of states without actions, again and again …
 const LINES_PER_EVENT: usize = 20;
 
-/// … and never more than this, a gigabyte at the most.
+/// … and limit of log lines in total, at most a gigabyte.
 const MAX_LINES: usize = 3_000_000;
 
-/// What the providers do.
+/// The environment.
 pub trait Oracle {
-    /// How a goal goes. `world` is its projection, or the actual world where it has none.
+    /// The course of a goal. `world` is its projection, or the actual world if it has none.
     fn perform(&mut self, path: &str, attempt: u32, goal: &Goal, world: &World) -> Performance;
 
-    /// What comes after a first result, of a goal that may improve it; nothing unless said: then the first is the last.
+    /// Results after the first one, for a goal that may improve; by default none.
     fn better(&mut self, path: &str, attempt: u32, goal: &Goal, first: &BTreeMap<String, Value>) -> Option<Better> {
         let _ = (path, attempt, goal, first);
         None
     }
 
-    /// What comes of a state that waits, and so many virtual seconds later; nothing unless said.
+    /// The event that ends a wait, after this number of virtual seconds; by default none.
     fn awaited(&mut self, path: &str, instance: InstanceId) -> Option<(f64, Event)> {
         let _ = (path, instance);
         None
     }
 }
 
-/// How a goal goes.
+/// The course of a goal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Performance {
     /// Virtual seconds until it answers.
@@ -68,54 +67,54 @@ pub struct Performance {
     pub answer: Answer,
 }
 
-/// What comes after the first result of a goal.
+/// Results after the first result of a goal.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Better {
-    /// Each so many virtual seconds after the first, with its output ports and what it costs.
+    /// Each with the virtual seconds after the first result, its output ports and its cost.
     pub results: Vec<(f64, BTreeMap<String, Value>, f64)>,
-    /// How the goal ends, so many virtual seconds after the first result; nothing where it goes on until it is told to stop.
+    /// The end of the goal, with the virtual seconds after the first result; `None` if it goes on until it is cancelled.
     pub end: Option<(f64, Answer)>,
 }
 
-/// The answer to a goal.
+/// The end of a goal.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Answer {
-    /// It has ended.
+    /// The goal has ended.
     Finished {
         /// The outcome.
         outcome: String,
         /// The output ports.
         outputs: BTreeMap<String, Value>,
-        /// Facts as measured.
+        /// The measured facts.
         measured: Vec<(FactKey, Value)>,
     },
     /// Its worker died.
     Crashed,
-    /// What it works with vanished under it, and with it its lease; another of its kind takes its place.
+    /// The goal's resource vanished, and with it its lease; another resource of the same kind replaces it.
     LeaseLost,
 }
 
-/// A run to make.
+/// The setup of a run.
 pub struct Setup {
     /// The task.
     pub program: Arc<Program>,
-    /// How it is executed.
+    /// The mode.
     pub mode: Mode,
     /// Its parameters, all bound.
     pub parameters: BTreeMap<String, Value>,
     /// The run's seed.
     pub seed: u64,
-    /// Everything there is, by kind.
+    /// All resources, by kind.
     pub resources: Vec<(String, ResourceOffer)>,
     /// The facts that hold before the task's own initial world.
     pub world: Vec<(FactKey, Value)>,
-    /// When a measured value is the predicted one.
+    /// Tolerance for measured values.
     pub tolerance: Tolerance,
-    /// Leases and projections take up to this long to come, at random by the seed; what crosses meanwhile, crosses.
+    /// Leases and projections take up to this long, at random by the seed, so that messages can cross.
     pub latency: Duration,
 }
 
-/// What became of it.
+/// The result of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Run {
     /// When it ended, in virtual seconds.
@@ -124,37 +123,37 @@ pub struct Run {
     pub outcome: String,
     /// Its outputs.
     pub outputs: BTreeMap<String, Value>,
-    /// Why, when the outcome is not success.
+    /// Reason, if the outcome is not success.
     pub reason: String,
     /// The event log.
     pub log: Vec<LogLine>,
     /// The root world at the end.
     pub world: World,
-    /// What there is of task resources at the end, by kind.
+    /// The task resources left at the end, by kind.
     pub units: BTreeMap<String, Quantity>,
 }
 
-/// A run that did not end as runs do: a broken promise of one of the cores.
+/// Error: a run did not end as it should, because one of the cores is wrong.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RunError {
-    /// Nothing is under way and the task has not ended.
+    /// Nothing is under way, but the task has not ended.
     #[error("at {at_s:.3} s nothing is under way and the task has not ended; {}", waits.join("; "))]
     Stuck {
         /// When.
         at_s: f64,
-        /// What waits for what.
+        /// Which instance waits for what.
         waits: Vec<String>,
     },
-    /// More events than any run should have.
+    /// There were more events than the limit.
     #[error("no end after {0} events")]
     Endless(usize),
-    /// Whoever has it simulated does not want to wait longer.
+    /// The caller stopped the simulation.
     #[error("it was ended at {at_s:.3} s of the task, before its end")]
     Stopped {
         /// When, in the run.
         at_s: f64,
     },
-    /// More lines of its log than any run should have.
+    /// There were more log lines than the limit.
     #[error("no end after {0} lines of its event log")]
     TooLong(usize),
     /// An invariant does not hold.
@@ -172,23 +171,23 @@ struct Simulation<'a> {
     pool: Pool,
     session: SessionId,
     root: World,
-    /// What the root was at each revision.
+    /// The root at each revision.
     roots: BTreeMap<Revision, World>,
-    /// The revision at which the executive's mirror was last found to be the root.
+    /// The last revision at which the executive's mirror was found equal to the root.
     mirrored: Option<Revision>,
     projections: BTreeMap<ProjectionId, World>,
-    /// What projections were asked for: the world pool makes one per instance and attempt.
+    /// Projections asked for: the world pool makes one per instance and attempt.
     projected: BTreeSet<(InstanceId, u32)>,
-    /// Projections that the executive knows of, and gives back itself.
+    /// Projections that the executive knows and will release itself.
     told: BTreeSet<ProjectionId>,
     next_projection: u64,
     waiters: BTreeMap<InstanceId, WaiterId>,
     /// The same by waiter.
     waiting: BTreeMap<WaiterId, InstanceId>,
     leases: BTreeMap<LeaseId, InstanceId>,
-    /// Leases that ended by themselves.
+    /// Leases that have ended by a loss.
     lost: BTreeSet<LeaseId>,
-    /// Whose requests are going to be refused.
+    /// Instances whose requests will be refused.
     refusing: BTreeSet<InstanceId>,
     grants: BTreeMap<InstanceId, u32>,
     circumstances: Circumstances,
@@ -202,16 +201,16 @@ struct Simulation<'a> {
     end: Option<(String, BTreeMap<String, Value>, String)>,
 }
 
-/// Makes the run. After every step it is checked that the pool and the executive's mirror are as they have to be ([`Checks::Environment`]).
+/// Makes the run. After every event the pool and the executive's mirror are checked ([`Checks::Environment`]).
 ///
 /// # Errors
-/// [`RunError`] where a core breaks a promise: the run gets stuck, never ends, or an invariant fails.
+/// [`RunError`] if a core is wrong: the run gets stuck, never ends, or an invariant does not hold.
 pub fn run(setup: Setup, oracle: &mut dyn Oracle) -> Result<Run, RunError> {
     run_looking_ahead(setup, oracle, 0)
 }
 
-/// As [`run`]; whenever much of the window has changed, so many orders of what is still to be done are simulated, and the
-/// executive is advised of one that is better than its own. None is plain dispatch.
+/// As [`run`]; whenever much of the window has changed, look-ahead simulates `orders` orders of the remaining work and advises the executive
+/// of a better one. 0 is plain dispatch.
 ///
 /// # Errors
 /// As [`run`].
@@ -219,7 +218,7 @@ pub fn run_looking_ahead(setup: Setup, oracle: &mut dyn Oracle, orders: usize) -
     run_under(setup, oracle, Circumstances { orders, ..Circumstances::default() })
 }
 
-/// As [`run`], with all that may happen beside what the providers do.
+/// As [`run`], with further circumstances.
 ///
 /// # Errors
 /// As [`run`].
@@ -227,7 +226,7 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
     run_while(setup, oracle, circumstances, &|| true)
 }
 
-/// As [`run_under`], as long as it shall go on, which is asked before every event.
+/// As [`run_under`], as long as `goes_on` returns true; it is called before every event.
 ///
 /// # Errors
 /// As [`run`]; [`RunError::Stopped`].
@@ -344,7 +343,7 @@ pub fn run_while(
         if simulation.circumstances.checks >= Checks::Everything {
             executive.check_invariants().map_err(|problem| simulation.broken(problem))?;
         }
-        // A timer that is due now, but not yet heard of, wakes whom it is for.
+        // A timer that is due now but not handled yet will wake its instance.
         let is_over = simulation.agenda.next_at().is_none_or(|next| next > now);
         if simulation.circumstances.examines && is_over {
             executive.check_quiescence(now).map_err(|problem| simulation.broken(problem))?;
@@ -366,9 +365,9 @@ pub fn run_while(
     Err(RunError::Endless(max_events))
 }
 
-/// A better order than the executive's own, if so many tries find one.
+/// Advice for a better order than the executive's own, if `orders` tries find one.
 fn advice(outlook: &Problem, orders: usize, seed: u64, memory: &mut Memory) -> Option<Event> {
-    // What cannot be planned goes as it goes.
+    // Without a plan the dispatch stays as it is.
     let mut search = Search::remembering(outlook, seed, memory).ok()?;
     search.step(orders);
     *memory = search.memory();
@@ -381,7 +380,7 @@ impl Simulation<'_> {
         self.agenda.add(self.now + delay, Entry::Event(event));
     }
 
-    /// What comes before the run begins: the executive keeps it, and has nothing to say to it.
+    /// Sends the events before the start of the run; the executive keeps them and gives no commands.
     fn send_before(&mut self, executive: &mut Executive) -> Result<(), RunError> {
         let events = std::mem::take(&mut self.circumstances.events);
         let (before, later): (Vec<_>, Vec<_>) =
@@ -396,7 +395,7 @@ impl Simulation<'_> {
         Ok(())
     }
 
-    /// A message about an attempt, which may come late or twice.
+    /// Sends a message about an attempt, which may arrive late or twice.
     fn send(&mut self, delay: Duration, kind: &str, instance: InstanceId, attempt: u32, event: Event) {
         let path = self.paths.get(&instance).map_or("", String::as_str);
         let delivery = self.circumstances.mischief.delivery(kind, path, attempt);
@@ -407,7 +406,7 @@ impl Simulation<'_> {
         self.at(first, event);
     }
 
-    /// What comes from outside at this occasion is put on the agenda.
+    /// Puts the events from outside that are due on this occasion on the agenda.
     fn bring_from_outside(&mut self, due: impl Fn(&Trigger) -> Option<Duration>) {
         let events = std::mem::take(&mut self.circumstances.events);
         for (trigger, event) in events {
@@ -418,22 +417,22 @@ impl Simulation<'_> {
         }
     }
 
-    /// What comes of an entry of the agenda: the event that the executive hears of, if any.
+    /// Handles an entry of the agenda; returns the event for the executive, if any.
     fn happens(&mut self, entry: Entry) -> Result<Option<Event>, RunError> {
         let event = match entry {
-            // The shell knows what it holds: word of what was given back meanwhile is none.
+            // The shell ignores messages about leases and projections that were given back meanwhile.
             Entry::Event(Event::Granted { instance, lease }) if self.leases.get(&lease.id) != Some(&instance) => {
                 return Ok(None);
             }
             Entry::Event(Event::Projected { projection, .. }) if !self.projections.contains_key(&projection) => {
                 return Ok(None);
             }
-            // So is a refusal of what was withdrawn.
+            // It ignores the refusal of a withdrawn request, too.
             Entry::Event(Event::Refused { instance, .. }) if !self.refusing.remove(&instance) => return Ok(None),
             Entry::Event(event) => event,
             Entry::Loss { lease, instance, attempt } => {
                 self.lose(lease)?;
-                // In reality what is performed under it ends before anything else begins there.
+                // In reality the goal under the lease ends before another one begins there.
                 self.busy.given_back(lease).ok();
                 Event::Crashed { instance, attempt, reason: "its lease was lost".to_owned(), unknown: false }
             }
@@ -456,7 +455,7 @@ impl Simulation<'_> {
         Ok(Some(event))
     }
 
-    /// A resource under a lease vanishes; another takes its place.
+    /// A resource under a lease vanishes, and another one replaces it.
     fn lose(&mut self, lease: LeaseId) -> Result<(), RunError> {
         let held = self.pool.leases().into_iter().find(|held| held.id == lease);
         let resources = held.map(|held| held.resources).unwrap_or_default();
@@ -469,7 +468,7 @@ impl Simulation<'_> {
         let attributes = resource.attributes.iter();
         spec.attributes.extend(attributes.map(|(name, value)| (name.to_owned(), value.clone())));
         self.pool.create(self.now, None, spec).map_err(|e| self.broken(e))?;
-        // With whatever else is under it, it is still to be given back.
+        // If it has other resources, the lease must still be given back.
         if !self.pool.leases().iter().any(|held| held.id == lease) {
             self.leases.remove(&lease);
             self.lost.insert(lease);
@@ -633,7 +632,7 @@ impl Simulation<'_> {
         Ok(())
     }
 
-    /// A withdrawal that crossed its grant.
+    /// Releases a grant that crossed its withdrawal.
     fn take_back_grant(&mut self, instance: InstanceId) -> Result<(), RunError> {
         let held = |lease: &LeaseId| self.leases.get(lease) == Some(&instance);
         let crossed = self.agenda.entries().find_map(|entry| match entry {
@@ -643,7 +642,7 @@ impl Simulation<'_> {
             _ => None,
         });
         let Some(lease) = crossed else { return Ok(()) };
-        // Its message, or messages, will be of a lease that nobody holds.
+        // Its messages will be about a lease that nobody holds.
         self.leases.remove(&lease);
         self.pool.release(self.now, Some(&self.session), lease).map_err(|e| self.broken(e))
     }
@@ -674,7 +673,7 @@ impl Simulation<'_> {
         }
     }
 
-    /// A goal ends so, after so many seconds.
+    /// Ends a goal with this answer, after this number of seconds.
     fn ends(&mut self, instance: InstanceId, attempt: u32, goal: &Goal, after_s: f64, answer: Answer) {
         let event = match answer {
             Answer::Finished { outcome, outputs, measured } => {
@@ -693,7 +692,7 @@ impl Simulation<'_> {
                         self.agenda.add(at, Entry::Loss { lease, instance, attempt });
                         return;
                     }
-                    // Of what is inside a routine only the worker dies.
+                    // Inside of a routine only the worker dies.
                     None => Event::Crashed { instance, attempt, reason: "the worker died".to_owned(), unknown: false },
                 }
             }
@@ -710,9 +709,9 @@ impl Simulation<'_> {
         units
     }
 
-    /// The pool's answers become events.
+    /// Turns the pool's notices into events.
     fn answers(&mut self) {
-        // Nothing of a simulated pool is kept.
+        // A simulated pool is not persistent.
         drop(self.pool.take_records());
         for notice in self.pool.take_notices() {
             let (waiter, lease) = match notice {
@@ -733,7 +732,7 @@ impl Simulation<'_> {
         }
     }
 
-    /// What is asked of the resource pool and was not granted, for people.
+    /// The requests that were not granted yet, for people.
     fn wanted(&self) -> Vec<String> {
         let asked = self.waiters.iter().filter_map(|(instance, waiter)| {
             let (_, request) = self.pool.waiter(*waiter)?;
@@ -760,8 +759,8 @@ impl Simulation<'_> {
         Ok(())
     }
 
-    /// The executive's mirror has the revision and the facts of the root. Facts are compared where a revision is new: all of them in a
-    /// small world, else some, others each time.
+    /// Checks that the executive's mirror has the revision and the facts of the root. Facts are compared at each new revision: all of them in
+    /// a small world, else a different part each time.
     fn check_mirror(&mut self, mirror: &World) -> Result<(), RunError> {
         let revision = self.root.revision();
         if mirror.revision() != revision {
@@ -789,7 +788,7 @@ impl Simulation<'_> {
     }
 }
 
-/// Puts everything that there is into a pool; the attributes of resources by kind, one after the other.
+/// Adds all resources to a pool, with the attributes of each kind's units in order.
 pub(crate) fn offer(
     pool: &mut Pool,
     resources: &[(String, ResourceOffer)],
@@ -811,7 +810,7 @@ pub(crate) fn offer(
     Ok(())
 }
 
-/// What a projection shows of a world, as the world pool does it: the facts that are read, and no others.
+/// What a projection shows of a world, as in the world pool: only the facts in `reads`.
 pub(crate) fn shown(world: World, reads: &Footprint) -> World {
     let Footprint::Patterns(patterns) = reads else { return world };
     let facts = patterns.iter().flat_map(|read| world.matching(read));

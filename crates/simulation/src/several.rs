@@ -1,9 +1,9 @@
-//! Several runs beside each other in virtual time: one resource pool, one root world, an executive each.
+//! Several concurrent runs in virtual time: one resource pool, one root world, an executive per run.
 //!
-//! What one run commits the others are told at once, as a change from outside. Leases and projections come late, at random. That the real system
-//! tells in time is not seen here: who gets a lease there has been told what its last holder committed (`ratn-task-control`).
+//! A commit of one run is sent to the others at once, as a change from outside. Leases and projections arrive late, at random. Not simulated:
+//! in the real system a holder of a lease is told in time what the last holder committed (`ratn-task-control`).
 //!
-//! The task control of a run may die without a word and be taken up again from its event log (`death`).
+//! The task control of a run may die without notice and be resumed from its event log (`death`).
 
 mod death;
 
@@ -31,84 +31,84 @@ use std::time::Duration;
 /// One of the runs.
 #[derive(Debug, Clone)]
 pub struct Together {
-    /// Its task, without parameters; it says nothing of its own of the initial world, creates and uses up no resources.
+    /// Its task, without parameters; it has no initial world of its own, and does not create or consume resources.
     pub program: Arc<Program>,
-    /// How it is executed.
+    /// The mode.
     pub mode: Mode,
     /// When it begins, in virtual seconds.
     pub begins_s: f64,
-    /// What an operator tells it, and so many virtual seconds after the start.
+    /// Events from an operator, with their times in virtual seconds.
     pub told: Vec<(f64, Event)>,
-    /// Its task control dies.
+    /// The death of its task control, if any.
     pub dies: Option<Death>,
 }
 
-/// What all of them are on.
+/// What all runs share.
 #[derive(Debug, Clone)]
 pub struct Shared {
-    /// Everything there is, by kind.
+    /// All resources, by kind.
     pub resources: Vec<(String, ResourceOffer)>,
-    /// The facts that hold at first.
+    /// The facts at the start.
     pub world: Vec<(FactKey, Value)>,
-    /// Leases and projections take up to this long to come, at random by the seed.
+    /// Leases and projections take up to this long, at random by the seed.
     pub latency: Duration,
     /// The seed.
     pub seed: u64,
 }
 
-/// What became of them.
+/// The result of all runs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AllEnded {
-    /// The outcome of each, and its reason.
+    /// Outcome and reason of each run.
     pub outcomes: Vec<(String, String)>,
     /// The root world at the end.
     pub world: World,
-    /// What happened, in order.
+    /// The history, in order.
     pub history: Vec<Happened>,
 }
 
-/// What happened, and to which run.
+/// One entry of the history.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Happened {
-    /// Its place among the runs.
+    /// The index of the run.
     pub run: usize,
     /// When, in virtual seconds.
     pub at_s: f64,
-    /// What.
+    /// What happened.
     pub what: What,
 }
 
-/// What may happen.
+/// The kinds of entries.
 #[derive(Debug, Clone, PartialEq)]
 pub enum What {
-    /// It was granted resources, by their ids.
+    /// The run was granted these resources, by their ids.
     Granted(LeaseId, Vec<String>),
-    /// It gave them back.
+    /// The run released the lease.
     GaveBack(LeaseId),
     /// A goal of the state with this path began.
     Began(String),
-    /// It ended, or its worker did.
+    /// The goal ended, or its worker died.
     Ended(String),
-    /// It was told to stop, and did.
+    /// The goal was cancelled.
     Cut(String),
-    /// A state's changes are real; the root after them.
+    /// A state's changes were committed; with the root after them.
     Committed(String, World),
     /// Its task control has died.
     Died,
-    /// It was taken up again from its event log.
+    /// Its task control was resumed from its event log.
     TakenUp {
-        /// What it held was gone.
+        /// Whether its resources were gone.
         has_lost: bool,
     },
 }
 
-/// A session lives so long that is kept alive.
+/// The lifetime of a session that is kept alive.
 const FOREVER: Duration = Duration::from_secs(10 * 365 * 24 * 3600);
 
-/// Makes the runs.
+/// Simulates the runs.
 ///
 /// # Errors
-/// [`RunError`] where a core breaks a promise: a run gets stuck, never ends, or its mirror is not the root.
+/// [`RunError`] if a core is wrong: a run gets stuck, never ends, or its mirror differs from the root.
 pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Result<AllEnded, RunError> {
     let broken = |problem: String| RunError::Broken { at_s: 0.0, problem };
     let mut pool = Pool::new(Limits::default());
@@ -159,7 +159,7 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
     system.until_all_have_ended(shared, runs)
 }
 
-/// What is due.
+/// The kinds of future entries.
 enum Due {
     Begin,
     Event(Box<Event>),
@@ -167,7 +167,7 @@ enum Due {
     TakenUp,
 }
 
-/// One run.
+/// The state of one run.
 struct One {
     executive: Executive,
     session: SessionId,
@@ -178,11 +178,11 @@ struct One {
     has_begun: bool,
     end: Option<(String, String)>,
     log: Vec<LogLine>,
-    /// What it has asked for and not heard of.
+    /// Requests that are not answered yet.
     asked: BTreeMap<InstanceId, (Vec<Requirement>, i64)>,
-    /// Grants that it has heard of.
+    /// Leases whose grants the run has received.
     heard: BTreeSet<LeaseId>,
-    /// What went with its session.
+    /// Leases that ended with its session.
     lost: BTreeSet<LeaseId>,
     death: Option<Death>,
     gone: Option<Gone>,
@@ -192,7 +192,7 @@ struct System<'a> {
     now: Timestamp,
     pool: Pool,
     root: World,
-    /// By time and order: of which run.
+    /// By time and order: the run and its entry.
     agenda: BTreeMap<(Timestamp, u64), (usize, Due)>,
     next: u64,
     projections: BTreeMap<ProjectionId, World>,
@@ -200,7 +200,7 @@ struct System<'a> {
     dice: Dice,
     runs: Vec<One>,
     history: Vec<Happened>,
-    /// Which run has changed which facts, one commit after the other.
+    /// By commit, the run and the changed facts.
     commits: Vec<(usize, Vec<FactKey>)>,
     oracle: &'a mut dyn Oracle,
 }
@@ -261,7 +261,7 @@ impl System<'_> {
                         gone.keep(now, event);
                         None
                     }
-                    // Word of what was given back meanwhile is none.
+                    // A grant that was given back meanwhile is ignored.
                     (Event::Granted { instance, lease }, one) if one.leases.get(&lease.id) != Some(&instance) => None,
                     (event, _) => Some(event),
                 },
@@ -279,7 +279,7 @@ impl System<'_> {
         Err(RunError::Endless(MAX_EVENTS))
     }
 
-    /// Tells a run, and performs what comes of it, if its task control does not die meanwhile.
+    /// Sends an event to a run and performs its commands, unless its task control dies meanwhile.
     fn tell(&mut self, run: usize, event: Event) -> Result<(), RunError> {
         self.runs[run].has_begun |= matches!(event, Event::Started { .. });
         let one = &self.runs[run];
@@ -316,7 +316,7 @@ impl System<'_> {
         self.runs[run].executive.check_invariants().map_err(|problem| self.broken(problem))
     }
 
-    /// What a run says to an event; both are in its log.
+    /// A run handles an event; both event and commands are logged.
     fn decide(&mut self, run: usize, event: Event) -> Vec<Command> {
         let (at, one) = (self.now, &mut self.runs[run]);
         let commands = one.executive.handle(at, event.clone());
@@ -325,7 +325,7 @@ impl System<'_> {
         commands
     }
 
-    /// Performs what a run has said, and tells the others of each revision that it makes.
+    /// Performs the commands of a run, and sends each new revision to the other runs.
     fn perform_all(&mut self, run: usize, commands: Vec<Command>) -> Result<(), RunError> {
         let mut told = Vec::new();
         for command in commands {
@@ -388,7 +388,7 @@ impl System<'_> {
                 let late = self.late();
                 self.at(run, late, Due::Event(Box::new(Event::Projected { instance, attempt, projection })));
             }
-            // Its provider performs nothing under a lease that has ended.
+            // The provider refuses a goal under a lease that has ended.
             Command::Start { instance, attempt, goal }
                 if goal.lease.as_ref().is_some_and(|lease| self.runs[run].lost.contains(&lease.id)) =>
             {
@@ -442,7 +442,7 @@ impl System<'_> {
         Ok(())
     }
 
-    /// Who holds what a node of a run needs for certain hears of it, if the node waits.
+    /// Notifies holders of resources that a certain node of a run needs, if the node has to wait.
     fn tell_holders(&mut self, run: usize, waiter: WaiterId) {
         let Some(why) = self.pool.explain(waiter) else { return };
         let leases: Vec<LeaseId> = why.held_by().collect();
@@ -464,7 +464,7 @@ impl System<'_> {
         self.pool.release(self.now, Some(&session), lease).map(drop).map_err(|error| self.broken(error))
     }
 
-    /// The pool's answers become events.
+    /// Turns the pool's notices into events.
     fn answers(&mut self) {
         drop(self.pool.take_records());
         for notice in self.pool.take_notices() {

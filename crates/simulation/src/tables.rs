@@ -1,4 +1,4 @@
-//! The paper's Table I and Table II, replayed: the example tasks with their estimated durations, through the executive.
+//! The paper's Table I and Table II: the example tasks, executed with their estimated durations.
 
 use crate::run::{Run, RunError, Setup, run_looking_ahead};
 use crate::timed::TimedProviders;
@@ -20,7 +20,7 @@ pub const FETCH_BOXES: &str = include_str!("../../../examples/fetch_boxes.yaml")
 /// The task of Table II.
 pub const SET_TABLE: &str = include_str!("../../../examples/set_table.yaml");
 
-/// Orders of what is left that are looked at whenever much of it has changed.
+/// Number of orders that look-ahead tries whenever much of the remaining work has changed.
 const ORDERS: usize = 500;
 
 /// One row, in seconds.
@@ -28,17 +28,17 @@ const ORDERS: usize = 500;
 pub struct Row {
     /// `I` or `II`.
     pub table: &'static str,
-    /// The number of boxes, or bowls and forks: `2B+2F`.
+    /// The number of boxes, or of bowls and forks: `2B+2F`.
     pub objects: String,
-    /// HSM mode.
+    /// Makespan in HSM mode.
     pub hsm_s: f64,
-    /// CDTN mode with one motion planner.
+    /// Makespan in CDTN mode with one motion planner.
     pub cdtn_1mp_s: f64,
-    /// CDTN mode with two motion planners.
+    /// Makespan in CDTN mode with two motion planners.
     pub cdtn_2mp_s: f64,
 }
 
-/// What the paper printed for a row; `None` where it printed nothing.
+/// The paper's figures for a row; `None` if it has none.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Paper {
     /// HSM mode.
@@ -47,11 +47,11 @@ pub struct Paper {
     pub cdtn_1mp_s: Option<f64>,
     /// CDTN with two.
     pub cdtn_2mp_s: f64,
-    /// Improvement of the latter over HSM mode.
+    /// Improvement of CDTN with two planners over HSM mode.
     pub improvement_percent: f64,
 }
 
-/// A table that could not be replayed.
+/// Error: a table could not be replayed.
 #[derive(Debug, thiserror::Error)]
 pub enum TableError {
     /// An example task does not load.
@@ -60,7 +60,7 @@ pub enum TableError {
     /// A parameter does not fit.
     #[error("{0}")]
     Parameter(#[from] ParameterError),
-    /// A run broke.
+    /// A run failed.
     #[error("{0}")]
     Run(#[from] RunError),
     /// A run ended with another outcome than success.
@@ -78,9 +78,9 @@ pub enum TableError {
 pub struct Scenario {
     /// `I` or `II`.
     pub table: &'static str,
-    /// As in [`Row::objects`].
+    /// The objects, as in [`Row::objects`].
     pub objects: String,
-    /// What the paper has for it.
+    /// The paper's figures.
     pub paper: Paper,
     source: &'static str,
     parameters: Vec<(String, String)>,
@@ -123,7 +123,7 @@ pub fn scenarios() -> Vec<Scenario> {
 /// Replays both tables.
 ///
 /// # Errors
-/// [`TableError`] where an example task is refused or a run does not end with success.
+/// [`TableError`] if an example task is refused or a run does not succeed.
 pub fn tables() -> Result<Vec<Row>, TableError> {
     scenarios()
         .iter()

@@ -1,5 +1,5 @@
-//! Providers in virtual time: each action takes as long as the task estimates, and answers what the real one would about a
-//! table with a given number of boxes on it. No geometry: a trajectory is its two ends.
+//! Providers in virtual time: each action takes its estimated duration and returns what the real one would, for a table
+//! with a given number of boxes. No geometry: a trajectory is only its two ends.
 
 use crate::run::{Answer, Oracle, Performance};
 use ratn_executive::protocol::Goal;
@@ -9,12 +9,12 @@ use ratn_model::value::{Trajectory, TrajectoryPoint, Value};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
 
-/// Seconds that an action takes whose state declares no duration.
+/// Duration of an action whose state declares none, in seconds.
 const UNDECLARED_S: f64 = 1.0;
 
 /// The providers of the paper's scenarios.
 pub struct TimedProviders {
-    /// How many boxes stand on the table.
+    /// Number of boxes on the table.
     pub boxes: usize,
 }
 
@@ -101,7 +101,7 @@ fn plan(goal: &Goal) -> Vec<(&'static str, Value)> {
     ]
 }
 
-/// Exactly along the trajectory to its end.
+/// The outputs of a motion that followed its trajectory exactly.
 fn followed(end: Value) -> Vec<(&'static str, Value)> {
     vec![("end", end), ("tracking_max_rad", Value::Float(0.0)), ("tracking_rms_rad", Value::Float(0.0))]
 }

@@ -1,9 +1,9 @@
 //! Anytime actions in random programs: results that get better, and what must not matter.
 //!
-//! Some computing actions get an output more, how good the result is, which motions are given as an input. What a motion does does not
-//! depend on it ("any of them will do"); what a computing action makes of it does, so there it must be that of the first result. The
-//! provider is a hostile one: its later results are incomplete or otherwise where they may not be, it dies, loses its lease, ends badly or
-//! never.
+//! Some computing actions get an additional output, the cost of their result, which motions take as an input. The effects of a motion do
+//! not depend on it ("any result is acceptable"). The results of a computing action do, so there it must be the cost of the first result.
+//! The provider is hostile: its later results are incomplete or change outputs that must not change; it dies, loses its lease, fails or
+//! never ends.
 
 use super::{Dice, Hash};
 use ratn_executive::protocol::Goal;
@@ -15,12 +15,11 @@ use ratn_model::value::{Type, Value};
 use ratn_simulation::run::{Answer, Better};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// How good a result is, less is better; as an input of a motion this and a number.
+/// The cost of a result, less is better; an input of a motion is named by this and a number.
 pub(super) const COST: &str = "cost";
-/// What the first result costs.
 const FIRST_COST: i64 = 100;
 
-/// Makes some computing actions give better results later, and passes on to others how good they are.
+/// Makes some computing actions anytime, and passes the costs of their results on to others.
 pub(super) fn improve(program: &mut Program, dice: &mut Dice) {
     let is_made = |state: &State| {
         matches!(state.kind, StateKind::Action { .. })
@@ -35,7 +34,7 @@ pub(super) fn improve(program: &mut Program, dice: &mut Dice) {
             state.annotations.anytime = true;
             outputs.insert(COST.to_owned(), Type::Int);
         }
-        // Most of what computes with a result looks at the rest of it alone.
+        // Most computing users of a result ignore its cost.
         let chance = if is_motion(&state.annotations) { 90 } else { 10 };
         let used = inputs.iter().filter_map(|(_, value)| match value {
             Expr::Port { state, .. } if chosen.contains(state) => Some(*state),
@@ -47,18 +46,18 @@ pub(super) fn improve(program: &mut Program, dice: &mut Dice) {
     }
 }
 
-/// Whether it may change something that is real.
+/// Whether an action may change something real.
 fn is_motion(said: &Annotations) -> bool {
     let changes = |line: &ResourceExpr| !matches!(line.operation, ResourceOperation::Block | ResourceOperation::Exists);
     said.nature == Nature::Irreversible || said.resources.iter().any(changes)
 }
 
-/// Whether what a node does depends on an input.
+/// Whether a node's behaviour depends on an input.
 pub(super) fn depends_on(state: &State, port: &str) -> bool {
     !is_motion(&state.annotations) || !port.starts_with(COST)
 }
 
-/// Ports without those that may be better in one mode than in the other.
+/// Ports without the costs, which may differ between the modes.
 pub(super) fn without_cost(ports: &BTreeMap<String, Value>) -> BTreeMap<String, Value> {
     ports
         .iter()
@@ -67,14 +66,14 @@ pub(super) fn without_cost(ports: &BTreeMap<String, Value>) -> BTreeMap<String, 
         .collect()
 }
 
-/// The outputs, with what the result costs where the action says so.
+/// Adds the cost to the outputs, if the action has it.
 pub(super) fn with_cost(state: &State, outputs: &mut BTreeMap<String, Value>) {
     if matches!(&state.kind, StateKind::Action { outputs, .. } if outputs.contains_key(COST)) {
         outputs.insert(COST.to_owned(), Value::Int(FIRST_COST));
     }
 }
 
-/// What comes after the first result, and how the goal ends then.
+/// The results after the first one, and the end of the goal.
 pub(super) fn later(
     seed: u64,
     path: &str,
@@ -89,7 +88,7 @@ pub(super) fn later(
     hash.add_number(u64::from(attempt));
     let mut dice = hash.dice();
     if dice.percent(10) {
-        // It has nothing to improve.
+        // The goal has nothing to improve.
         return None;
     }
     let mut after_s = 0.0;

@@ -1,4 +1,4 @@
-//! What comes of the states of random programs that wait: a function of their paths, the same in both modes.
+//! How the waits of random programs end: a function of their paths, the same in both modes.
 
 use super::{Dice, Hash, HashOracle, state_of};
 use ratn_executive::protocol::Event;
@@ -9,13 +9,13 @@ use ratn_model::program::Program;
 use ratn_model::value::Value;
 use ratn_model::wait::Wait;
 
-/// How many of a hundred waits that may take too long do.
+/// Percentage of waits with a timeout that reach it.
 const LATE_PERCENT: u64 = 35;
-/// How many of a hundred states that wait for a signal are sent some before they wait.
+/// Percentage of states that wait for a signal to which some signals are sent before they wait.
 const EARLY_PERCENT: u64 = 30;
 
 impl HashOracle<'_> {
-    /// What comes of a wait, and when; nothing where it is over by itself, or never.
+    /// The event that ends a wait, and when; `None` if the wait ends by itself or never.
     pub(super) fn comes(&self, path: &str, instance: InstanceId) -> Option<(f64, Event)> {
         let state = state_of(self.program, path)?;
         let mut hash = Hash(self.seed);
@@ -60,7 +60,7 @@ pub(super) fn early_signals(program: &Program, seed: u64) -> Vec<(String, Value)
     early
 }
 
-/// The facts that make a condition of the generator hold.
+/// The facts that make a condition of the generator true (or false, by `holds`).
 fn make(condition: &Expr, holds: bool, facts: &mut Vec<(FactKey, Option<Value>)>) {
     match condition {
         Expr::Binary(BinaryOperator::And, a, b) => {

@@ -1,16 +1,16 @@
-//! Programs that look at no fact, with imprecise motions that fail ([`super::Features::IMPRECISE`]): their outcomes are the same in
+//! Programs that read no fact, with imprecise motions that fail ([`super::Features::IMPRECISE`]): their outcomes are the same in
 //! both modes.
 //!
-//! Where motions are imprecise, a failure leaves a world that HSM mode never has, so worlds are not compared. But what is decided
-//! by ports, literals and outcomes alone, with an oracle that sees only path, try and inputs, does not depend on the world. So the
-//! task's outcome and outputs, and the result of every state that HSM mode retired, are what they are in HSM mode, and what HSM
-//! mode does CDTN mode does, too. It may have done more: motions that ran beside the one that failed.
+//! With imprecise motions, a failure leaves a world that HSM mode never has, so worlds are not compared. But decisions that depend
+//! only on ports, literals and outcomes, with an oracle that sees only path, try and inputs, do not depend on the world. So the
+//! task's outcome and outputs, and the result of every state that retired in HSM mode, must be the same, and CDTN mode must perform
+//! every motion of HSM mode. It may perform more: motions that ran beside the one that failed.
 
 use super::story::Story;
 use ratn_simulation::run::Run;
 use std::collections::BTreeSet;
 
-/// The first outcome or motion of HSM mode that CDTN mode does not have.
+/// The first outcome or motion of HSM mode that is missing in CDTN mode.
 pub(super) fn problem((hsm, before): (&Run, &Story), (cdtn, after): (&Run, &Story)) -> Option<String> {
     lost_outcome((hsm, before), (cdtn, after)).or_else(|| {
         let started: BTreeSet<(&str, &str)> = after.acts.iter().map(|act| (&*act.path, &*act.goal)).collect();
@@ -19,7 +19,7 @@ pub(super) fn problem((hsm, before): (&Run, &Story), (cdtn, after): (&Run, &Stor
     })
 }
 
-/// The first outcome of HSM mode that CDTN mode does not have.
+/// The first outcome of HSM mode that is missing in CDTN mode.
 fn lost_outcome((hsm, before): (&Run, &Story), (cdtn, after): (&Run, &Story)) -> Option<String> {
     if (&hsm.outcome, &hsm.outputs) != (&cdtn.outcome, &cdtn.outputs) {
         let end = |run: &Run| format!("{} ({}) {:?}", run.outcome, run.reason, run.outputs);
@@ -77,7 +77,7 @@ states:
   - repair: { action: base/drive, pia: true, reads: [], effects: { success: [], aborted: [] }, resources: [{ block: Base }] }
 ";
 
-    /// The motions take what is estimated; one may abort.
+    /// Motions with their estimated durations; one may abort.
     struct Motions(&'static str);
 
     impl Oracle for Motions {
@@ -116,7 +116,7 @@ states:
         let hsm = run_of(Mode::Hsm, "both/turn");
         assert!(hsm.1.retired.contains_key("repair"), "{:?}", hsm.1.retired);
         assert_eq!(difference(&hsm, &run_of(Mode::Hsm, "both/turn")), None);
-        // As if nobody had heard of the failure.
+        // As if the failure had been lost.
         assert!(difference(&hsm, &run_of(Mode::Hsm, "nothing")).is_some());
     }
 

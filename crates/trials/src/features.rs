@@ -1,7 +1,7 @@
-//! What random programs are made of. A failure is looked into with as little as still shows it.
+//! The features of random programs. A failure is examined with as few of them as still show it.
 
-/// What random programs are made of, beside sequences, hierarchies, loops over lists, conditions, routines and all three kinds
-/// of actions.
+/// The features of random programs, in addition to sequences, hierarchies, loops over lists, conditions, routines and all three kinds of
+/// actions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Features {
     /// Custom outcomes, handlers of failures, jumps forward and back.
@@ -10,63 +10,63 @@ pub struct Features {
     pub whiles: bool,
     /// Concurrencies whose regions do not conflict.
     pub regions: bool,
-    /// Concurrencies whose first region ends the others.
+    /// Concurrencies in which the first region that ends preempts the others.
     pub preemptive: bool,
     /// Scoped variables, assignments, defaults of ports.
     pub variables: bool,
-    /// Tries after failures, and timeouts of goals that never answer.
+    /// Retries after failures, and timeouts of goals that never answer.
     pub retries: bool,
     /// Numeric preconditions, quantified effects, effects per custom outcome.
     pub effects: bool,
-    /// Measured facts that are not as predicted.
+    /// Measured facts that differ from the predictions.
     pub measured: bool,
     /// Results that do not depend on the seed; small widths; exceptional outcomes.
     pub speculation: bool,
-    /// Facts of no, two and three arguments, individuals, wildcards, queries, records and their fields.
+    /// Facts with zero, two and three arguments, individuals, wildcards, queries, records and their fields.
     pub facts: bool,
-    /// Keys that come from ports, quantified effects within each other, lists that may be empty.
+    /// Keys that come from ports, nested quantified effects, lists that may be empty.
     pub keys: bool,
-    /// Numeric effects of any amount, and such as are made of the fact itself.
+    /// Numeric effects of any amount, and effects that depend on the fact itself.
     pub amounts: bool,
     /// A predicate that is measured within a tolerance, and ontologies.
     pub tolerance: bool,
-    /// Hierarchies that see nothing of what is around them, and parameters.
+    /// Hierarchies that see nothing of their surroundings, and parameters.
     pub libraries: bool,
-    /// Resources that are chosen by attributes, divisible, scarce, or never come back.
+    /// Resources that are selected by attributes, divisible, scarce, or not renewable.
     pub supplies: bool,
-    /// Durations, learned ones and learned outcomes; attempts of which none is left.
+    /// Durations, learned durations and learned outcomes; attempts that are used up.
     pub estimates: bool,
-    /// Shapes in which bugs were found that chance does not make: see `generator/patterns`.
+    /// Shapes in which bugs were found and that chance does not make: see `generator/patterns`.
     pub patterns: bool,
     /// Emergency stops, refused resources, runs that are resumed.
     pub incidents: bool,
     /// Loops of a thousand, chains of a hundred.
     pub long: bool,
-    /// Nothing looks at the world, so that what is done never depends on it.
+    /// No state reads the world, so that behaviour never depends on it.
     pub blind: bool,
-    /// What the safety theorem excludes: imprecise exceptions, unordered resources, regions that share facts.
+    /// What the safety theorem excludes: imprecise exceptions, unordered resources, shared facts.
     pub weak: bool,
-    /// Parts of expressions stand in comprehensions that come to the same.
+    /// Parts of expressions are replaced by equivalent comprehensions.
     pub lists: bool,
-    /// States that are tried again, with something done before; something that is done on every way out.
+    /// `retry` with `before`, and `finally`.
     pub guards: bool,
     /// States that wait: for a time, a condition, a signal, an answer.
     pub waits: bool,
-    /// Motions and hierarchies that are watched: something must hold from their start to their end.
+    /// Motions and hierarchies with `while` conditions.
     pub watched: bool,
-    /// Queries are said with what they find.
+    /// Queries are replaced by equivalent uses of `find`.
     pub finds: bool,
-    /// Actions whose results get better after they were given.
+    /// Anytime actions.
     pub anytime: bool,
-    /// Limits of composites, and races whose regions touch nothing of each other; something is done on every way out of states inside of
-    /// these and of regions, and being cut short changes the world.
+    /// Timeouts of composites, and races whose regions share nothing; `finally` of states inside of these and of regions; effects for
+    /// the outcome `preempted`.
     pub ways_out: bool,
-    /// Outputs of conditions, loops and concurrencies, and what different ways give.
+    /// Outputs of conditions, loops and concurrencies, with values that depend on the way taken.
     pub outputs: bool,
 }
 
 impl Features {
-    /// What was made first, under the assumptions of the safety theorem. What its seeds mean never changes.
+    /// The first set of features, under the assumptions of the safety theorem. The programs of its seeds never change.
     pub const ALL: Features = Features {
         transitions: true,
         whiles: true,
@@ -132,7 +132,7 @@ impl Features {
         outputs: false,
     };
 
-    /// [`Features::ALL`], without those assumptions.
+    /// [`Features::ALL`], without these assumptions.
     pub const WEAK: Features = Features { weak: true, ..Features::ALL };
 
     /// The whole model, under the assumptions of the safety theorem.
@@ -150,28 +150,28 @@ impl Features {
         ..Features::ALL
     };
 
-    /// [`Features::EVERYTHING`], said with comprehensions.
+    /// [`Features::EVERYTHING`], rewritten with comprehensions.
     pub const LISTS: Features = Features { lists: true, ..Features::EVERYTHING };
 
-    /// [`Features::EVERYTHING`], with retries of composites and what is done on every way out.
+    /// [`Features::EVERYTHING`], with retries of composites and `finally`.
     pub const GUARDS: Features = Features { guards: true, ..Features::EVERYTHING };
 
     /// [`Features::GUARDS`], with states that wait.
     pub const WAITS: Features = Features { waits: true, ..Features::GUARDS };
 
-    /// [`Features::WAITS`], with states that are watched, and with what queries find.
+    /// [`Features::WAITS`], with watched states, and with `find`.
     pub const WATCHED: Features = Features { watched: true, finds: true, ..Features::WAITS };
 
-    /// [`Features::WATCHED`], with results that get better after they were given.
+    /// [`Features::WATCHED`], with anytime actions.
     pub const ANYTIME: Features = Features { anytime: true, ..Features::WATCHED };
 
     /// [`Features::WATCHED`], with more ways out.
     pub const WAYS_OUT: Features = Features { ways_out: true, ..Features::WATCHED };
 
-    /// [`Features::WAYS_OUT`], with outputs of everything that contains states.
+    /// [`Features::WAYS_OUT`], with outputs of all composite states.
     pub const OUTPUTS: Features = Features { outputs: true, ..Features::WAYS_OUT };
 
-    /// What a task file can say of actions whose catalogue says a part of it ([`crate::inherited()`]).
+    /// What a task file can express for actions whose annotations are partly in the catalogue ([`crate::inherited()`]).
     pub const INHERITED: Features = Features {
         transitions: false,
         preemptive: false,
@@ -183,8 +183,8 @@ impl Features {
         ..Features::ALL
     };
 
-    /// Imprecise motions that fail, in programs that never look at the world: where a failure leads is then the same in both
-    /// modes, whatever younger motions have done meanwhile.
+    /// Imprecise motions that fail, in programs that never read the world: a failure then leads to the same place in both modes,
+    /// whatever younger motions have done meanwhile.
     pub const IMPRECISE: Features = Features {
         effects: false,
         measured: false,

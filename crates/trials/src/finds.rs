@@ -1,4 +1,4 @@
-//! The same program, said with what queries find: that there is an answer is that something is found.
+//! Rewrites a program with `find`: a query has an answer exactly if `find` finds something.
 
 use super::Dice;
 use ratn_model::expression::query::plan;
@@ -6,17 +6,17 @@ use ratn_model::expression::{BinaryOperator, Expr, Function};
 use ratn_model::program::Program;
 use ratn_model::value::Value;
 
-/// Of a hundred queries so many are said so.
+/// Percentage of queries that are rewritten.
 const SAID_SO: u64 = 60;
 
-/// Says some queries of a program with `find`.
+/// Rewrites some queries of a program with `find`.
 pub(super) fn say_with_find(program: &mut Program, dice: &mut Dice) {
     for state in &mut program.states {
         state.each_expression_mut(&mut |_, expression| outermost(expression, dice));
     }
 }
 
-/// Only queries that stand in no other: a `find` has variables of its own.
+/// Only queries that are not inside of others, because a `find` has its own variables.
 fn outermost(expression: &mut Expr, dice: &mut Dice) {
     match expression {
         Expr::Query(conditions) => {

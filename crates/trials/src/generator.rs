@@ -1,23 +1,21 @@
-//! The random program of a seed: its states and how they lead to each other.
+//! The random program of a seed: its states and transitions.
 //!
-//! Every program ends: only the outcome [`AGAIN`] leads back, only the oracle says it, and never on a third visit; and every
-//! `while` counts. Regions of a barrier write facts, block actuators and assign variables that no other region touches. A
-//! preemptive concurrency stands in no barrier and holds a few actions only, which have nothing to fail of before they start, so
-//! that the oracle can keep the moments at which its regions end apart by more than anything else may shift them.
+//! Every program ends: only the outcome [`AGAIN`] leads back, only the oracle gives it, and never on a third visit; and every `while` counts. Regions of a
+//! barrier write facts, block actuators and assign variables that no other region uses. A preemptive concurrency is not inside of a barrier and contains only a
+//! few actions, which cannot fail before they start, so that the oracle can keep the ends of its regions further apart than any other delay.
 //!
 //! | | |
 //! |---|---|
 //! | the tree | `list`, `composite`, `regions`, `action`, `guards`, `waits`, `watched`, `ways_out`, `outputs`, `long`, `patterns` |
-//! | what is said of a state | `annotations`, `variables`, `supplies`, `estimates` |
+//! | annotations of a state | `annotations`, `variables`, `supplies`, `estimates` |
 //! | facts | `facts`, `effects`, `tolerance` |
 //!
-//! What it does not make: limits of what is beside others or holds a race; waits in races and beside imprecise motions, conditions of waits with keys that are not constants (scenarios of the
-//! simulation have them); hierarchies and concurrencies with tolerated facts or port keys in their effects; numbers within a
-//! tolerance that add up, or that are looked up by anything that compares exactly; individuals of classes (ontologies declare
-//! numbers and things); values that are poses, joint positions or trajectories; selectors of task resources; task resources and
-//! batteries that run out; consumption inside of routines; facts in `duration`; preemptive concurrencies within others, in
-//! routines, or with anything that may fail to begin; transitions into the middle of a state; libraries of files (what the
-//! loader makes of one is made directly). What actions say in a catalogue is made of its programs by [`crate::inherited()`].
+//! It does not make: timeouts of states beside others or with a race inside; waits in races and beside imprecise motions; conditions of waits with keys that
+//! are not constants (scenarios of the simulation have them); hierarchies and concurrencies with tolerated facts or port keys in their effects; numbers within
+//! a tolerance that add up, or that are looked up by anything that compares exactly; individuals of classes (ontologies declare numbers and things); values
+//! that are poses, joint positions or trajectories; selectors of task resources; task resources and batteries that run out; consumption inside of routines;
+//! facts in `duration`; preemptive concurrencies within others, in routines, or with anything that may fail to begin; transitions into the middle of a state;
+//! libraries of files (the result of loading one is made directly). Annotations in a catalogue are made from its programs by [`crate::inherited()`].
 
 use super::{
     AGAIN, ARGUMENTS, Dice, EMPTY, FOUND, Features, PART, PREDICATES, TOOL, anytime, around, finds, is_in_routine,
@@ -53,7 +51,7 @@ mod waits;
 mod watched;
 mod ways_out;
 
-/// No program has many more states.
+/// Approximate limit of the states of a program.
 const MAX_STATES: usize = 26;
 
 /// The random program of a seed.
@@ -137,7 +135,7 @@ pub fn program(seed: u64, features: &Features) -> Program {
     let regions = program.states.iter().filter(|state| is_preemptive(state));
     let around: Vec<StateId> = regions.flat_map(|state| around(&program, state)).map(|state| state.id).collect();
     for id in around {
-        // Blocks go to every state inside: regions that race must not wait for each other's workers.
+        // A block holds for every state inside, and regions of a race must not wait for each other's workers.
         program.states[id.0 as usize].annotations.resources.retain(|r| r.operation != ResourceOperation::Block);
     }
     if features.finds {
@@ -152,8 +150,8 @@ pub fn program(seed: u64, features: &Features) -> Program {
     program
 }
 
-/// A routine acquires at its entry what anything in it consumes, come to it or not: it is another program then than state by state.
-/// In random routines nothing is consumed.
+/// Removes consumption from routines: a routine acquires at its entry what any inner state consumes, even if that state is never reached, so it would differ
+/// from its states one by one.
 fn create_in_routines(program: &mut Program) {
     let inside: Vec<StateId> =
         program.states.iter().filter(|state| is_in_routine(program, state)).map(|state| state.id).collect();
@@ -167,7 +165,7 @@ fn create_in_routines(program: &mut Program) {
     }
 }
 
-/// Nothing looks at the world any more, and no change depends on it.
+/// Makes a program in which nothing reads the world, and no change depends on it.
 fn make_blind(program: &mut Program) {
     use ratn_model::program::Nature;
     let looked_up = |part: &mut Expr| match part {
@@ -186,7 +184,7 @@ fn make_blind(program: &mut Program) {
         for effects in a.effects.values_mut() {
             effects.retain(|effect| !matches!(effect, EffectExpr::Increase(..)));
         }
-        // What holds a fact is a constant then, whatever its arguments were.
+        // Facts are replaced by constants.
         state.each_expression_mut(&mut |_, expression| expression.rewrite(&mut |part| looked_up(part)));
     }
 }
@@ -195,31 +193,31 @@ pub(super) fn fact_at(predicate: u64, argument: i64) -> FactExpr {
     FactExpr { predicate: format!("p{predicate}"), arguments: vec![Some(Expr::Literal(Value::Int(argument)))] }
 }
 
-/// What a list of states may touch.
+/// What a list of states may use.
 #[derive(Debug, Clone)]
 pub(super) struct Room {
     /// Predicates that it may read.
     pub(super) readable: Vec<u64>,
     /// Predicates that it may write.
     pub(super) writable: Vec<u64>,
-    /// It may read and write the predicate that is measured within a tolerance.
+    /// Whether it may read and write the predicate that is measured within a tolerance.
     pub(super) tolerant: bool,
-    /// What of the robot it may block.
+    /// The actuators that it may block.
     pub(super) actuators: Vec<&'static str>,
-    /// Nothing runs beside it: it may touch anything, and task resources.
+    /// Whether nothing runs beside it, so that it may use anything, and task resources.
     pub(super) is_alone: bool,
-    /// It is inside a preemptive concurrency.
+    /// Whether it is inside of a preemptive concurrency.
     pub(super) is_preemptive: bool,
 }
 
-/// What a state may name.
+/// The names that a state may use.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Visible {
     /// States with an output `x`.
     pub(super) ports: Vec<StateId>,
-    /// Loop variables and scoped ones: every action gets all of them.
+    /// Loop variables and scoped variables: every action gets all of them.
     pub(super) variables: Vec<String>,
-    /// Those that may be given new values.
+    /// Variables that may be assigned.
     pub(super) assignable: Vec<String>,
 }
 

@@ -1,15 +1,15 @@
-//! Runs that are aborted or reach their deadline at any moment, or in which the world changes at any moment.
+//! Runs that are aborted or reach their deadline at any moment, and runs in which the world changes at any moment.
 //!
 //! What is compared:
 //!
-//! | what happens | compared |
+//! | event | comparison |
 //! |---|---|
 //! | the user ends the run when a PIA starts, no regions | both modes end alike: PIAs, changes, world, outcome |
-//! | the same with regions; at any moment; a deadline | of each mode: its PIAs are a closed part of those of HSM mode undisturbed, with the same goals and in its order; its changes are, predicate by predicate (fact by fact where there are regions), the first of HSM mode's; without regions, they are its first changes in one order; the outcome is `preempted`, or `aborted` at the deadline, or the run had ended before, as ever |
-//! | the same of a program with something to do on every way out, or that says what being cut short means | of each mode: there is a place of the program, or one in each region, at which the reference, told to end there, does the same PIAs with the same goals, the same changes, and leaves the same world; with races of regions, the outcome |
+//! | the same with regions; at any moment; a deadline | for each mode: its PIAs are a closed subset of those of the undisturbed HSM run, with the same goals and in the same order; its changes are, by predicate (by fact if there are regions), the first changes of that run; without regions, they are its first changes in one order; the outcome is `preempted`, or `aborted` at the deadline, or the run had ended normally before |
+//! | the same for a program with `finally` or with effects for `preempted` | for each mode: there is a place of the program, or one in each region, at which the reference, told to end there, performs the same PIAs with the same goals, makes the same changes, and leaves the same world; with races of regions, the outcome |
 //! | the world changes at any moment | see [`super::outside`] |
 //!
-//! That nothing is left over in any of them the simulation checks by itself.
+//! The simulation itself checks that nothing is left over in any of them.
 
 use super::outside::trial_at_any_moment;
 use super::story::story;
@@ -53,7 +53,8 @@ pub fn trial_interrupted(program: &Arc<Program>, conditions: &Conditions) -> Ver
     }
 }
 
-/// Both modes do the first of what HSM mode does undisturbed, end by this outcome, and maybe end alike.
+/// Checks that both modes do a first part of the undisturbed HSM run and end by this outcome; with `alike`, in the same
+/// way.
 fn parts(
     program: &Arc<Program>,
     conditions: &Conditions,
@@ -64,7 +65,7 @@ fn parts(
     parts_of(program, program, conditions, whole, (outside, outcome), alike)
 }
 
-/// The same of a program that is another one but for its deadline.
+/// The same for a program that differs from the undisturbed one in its deadline.
 fn parts_of(
     program: &Arc<Program>,
     unlimited: &Program,
@@ -99,7 +100,7 @@ fn parts_of(
     Verdict::Same { hsm_s: ends[0].end_s, cdtn_s: ends[1].end_s, acts: stories.1.acts.len() }
 }
 
-/// What a run did otherwise than one that is told to end at some place and then does what is to be done on its way out.
+/// The difference of a run from every run that is told to end at some place and then executes its way out.
 fn leaves_otherwise(
     program: &Program,
     conditions: &Conditions,
@@ -117,7 +118,7 @@ fn leaves_otherwise(
     }
     let told = story(program, part);
     let known = is_cut_somewhere(program, conditions, part, &told, outcome);
-    // It may have been told to end when it had ended, by the same outcome.
+    // It may have been told to end after it had ended with the same outcome.
     let is_otherwise = known == Some(false) && same_end(whole, part).is_some();
     is_otherwise.then(|| {
         let acts: Vec<&str> = told.acts.iter().map(|act| act.path.as_str()).collect();

@@ -1,31 +1,31 @@
 //! Random task programs and a random but fixed world for them: the *oracle* of the safety theorem.
 //!
-//! A program is made of what the task model has ([`Features`]; what is never made, `generator` says), annotated truly but often
-//! only in part. What a node
-//! does is a hash of what it is entitled to see: its path with visit numbers and its try, its inputs, and the facts that it
-//! declares to read, sense or require. Any read from a wrong world changes the result, and with it everything after.
+//! Programs contain what the task model has ([`Features`]; exceptions: `generator`), with annotations that are true but often
+//! incomplete. The behaviour of a node is a hash of what it is entitled to see: its path with visit numbers and its try, its inputs,
+//! and the facts that it declares to read, sense or require. So any read from a wrong world changes the result, and everything after
+//! it.
 //!
-//! What is compared, by what happens to a run:
+//! What is compared, by what happens in a run:
 //!
 //! | | |
 //! |---|---|
 //! | nothing, failures, crashes, lost leases, late messages, pauses and steps, refused resources, emergency stops, a resume | everything: [`trial`] |
 //! | the world changes from outside at the start of a PIA | everything: [`trial_from_outside`] |
-//! | it changes at any time; the user ends the run; a deadline | everything where one place of the program is meant, else what is done is a part of what is done undisturbed: [`trial_interrupted`] |
-//! | motions with imprecise exceptions, shared facts | that what acts is decided and final; without failures, the world |
-//! | the same where nothing looks at the world ([`Features::IMPRECISE`]) | the outcome, every result of HSM mode, and that all its PIAs start |
+//! | it changes at any time; the user ends the run; a deadline | everything if that is at one place of the program, else that a part of the undisturbed run is done: [`trial_interrupted`] |
+//! | motions with imprecise exceptions, shared facts | that PIAs are decided and final; without failures, the world |
+//! | the same if nothing reads the world ([`Features::IMPRECISE`]) | the outcome, every result of HSM mode, and that all its PIAs start |
 //!
-//! Every run is replayed from its log, and the executive's invariants hold after each of its events. CDTN mode's is made once more, and
-//! after each moment everything that waits is looked at again: no instance could have gone on that was not woken.
+//! Every run is replayed from its log, and the executive's invariants are checked after each event. The CDTN run is repeated, and after
+//! each moment everything that waits is examined again: no instance may have been forgotten that could go on.
 //!
 //! | | |
 //! |---|---|
-//! | programs | `generator`, `features`, `listing`; as task files with a catalogue that says a part of them: `inherited` |
+//! | programs | `generator`, `features`, `listing`; as task files with a part of the annotations in a catalogue: `inherited` |
 //! | their world | `oracle`, `awaited`, `anytime`, `dice` |
-//! | both modes beside each other | `trial`, `outside`, `interrupt`, `story`, `weak`, `blind` |
-//! | both modes beside a plain evaluation of the program | `reference` |
-//! | every run once more from its log | `replay` |
-//! | smaller programs that fail alike | `shrink`, `rewrite` |
+//! | both modes compared | `trial`, `outside`, `interrupt`, `story`, `weak`, `blind` |
+//! | both modes compared with a plain evaluation of the program | `reference` |
+//! | every run repeated from its log | `replay` |
+//! | smaller programs with the same failure | `shrink`, `rewrite` |
 
 mod anytime;
 mod awaited;
@@ -78,14 +78,14 @@ pub const RESOURCES: [(&str, ResourceClass, u32); 7] = [
     (WORLD_MODEL, ResourceClass::World, 3),
 ];
 
-/// A tool with attributes, one of three; power of which a part can be had, and a battery that nobody fills again.
+/// Three tools with attributes; divisible power; a battery that is never recharged.
 const TOOL: &str = "Tool";
 const POWER: &str = "Power";
 const BATTERY: &str = "Battery";
-/// More states than any program has that is no chain.
+/// No program except chains has so many states.
 const MANY_STATES: usize = 90;
 
-/// Everything there is for random programs.
+/// All resources for random programs.
 pub fn offers() -> Vec<(String, ResourceOffer)> {
     let plain = RESOURCES.iter().map(|(kind, class, units)| ((*kind).to_owned(), ResourceOffer::new(*class, *units)));
     let part = |thousandths| Quantity::from_thousandths(thousandths);
@@ -103,7 +103,7 @@ pub fn offers() -> Vec<(String, ResourceOffer)> {
     plain.chain(more).collect()
 }
 
-/// What the units of the kinds of resources are like, one after the other.
+/// The attributes of the units of each kind, in order.
 fn attributes() -> BTreeMap<String, Vec<BTreeMap<String, Value>>> {
     let tool = |level: i64, cuts: bool| {
         let mut attributes = BTreeMap::from([("level".to_owned(), Value::Int(level))]);
@@ -115,7 +115,7 @@ fn attributes() -> BTreeMap<String, Vec<BTreeMap<String, Value>>> {
     BTreeMap::from([(TOOL.to_owned(), vec![tool(1, false), tool(2, true), tool(3, false)])])
 }
 
-/// Whether the program is a long one: it may take many events.
+/// Whether a program is long, so that it may need many events.
 fn is_long(program: &Program) -> bool {
     let many = |state: &State| match &state.kind {
         StateKind::ForEach { collection: Expr::Call(Function::Range, to), .. } => {
@@ -128,19 +128,19 @@ fn is_long(program: &Program) -> bool {
 
 /// The task resource of random programs.
 const PART: &str = "Part";
-/// So many are there at the start: no program uses them up.
+/// The number of parts at the start; no program uses them up.
 const PARTS: u32 = 400;
 /// Predicates of random worlds: `p0(n)` … `p5(n)`.
 const PREDICATES: u64 = 6;
-/// Arguments are below this.
+/// Upper limit (exclusive) of arguments.
 const ARGUMENTS: u64 = 3;
-/// The outcome that may lead back; no visit after the second ends by it.
+/// The outcome that may lead back; it never occurs after the second visit.
 const AGAIN: &str = "again";
 /// The other custom outcomes lead on.
 const FOUND: &str = "found";
 const EMPTY: &str = "empty";
 
-/// The state of a path with visits.
+/// The state at a path with visits.
 fn state_of<'a>(program: &'a Program, path: &str) -> Option<&'a State> {
     let plain = plain(path);
     program.states.iter().find(|state| state.path == plain)
@@ -152,18 +152,18 @@ fn plain(path: &str) -> String {
     parts.collect::<Vec<_>>().join("/")
 }
 
-/// The state and all around it, from the inside out.
+/// The state and the states around it, from inside out.
 fn around<'a>(program: &'a Program, state: &'a State) -> impl Iterator<Item = &'a State> {
     std::iter::successors(Some(state), |s| s.parent.map(|id| program.state(id)))
 }
 
-/// Whether the state is, or is inside of, something that the window executes as one node.
+/// Whether the state is, or is inside of, a state that the window executes as one node.
 fn is_in_routine(program: &Program, state: &State) -> bool {
     around(program, state).any(State::is_routine)
 }
 
-/// Changes of what goes by the same name are compared in their order: of one fact where there are regions, which have no order and may
-/// change different facts of one predicate, else of one predicate.
+/// Changes with the same name are compared in order. The name is the fact if there are regions, because these are not ordered and may
+/// change different facts of one predicate; else the predicate.
 fn compared_as(program: &Program, change: &Change) -> String {
     let pattern = change.pattern();
     let has_regions = program.states.iter().any(|state| matches!(state.kind, StateKind::Concurrency { .. }));

@@ -1,9 +1,9 @@
-//! A program as text that a person can read: a line per state, indented as they contain each other.
+//! A program as readable text: one line per state, indented by depth.
 
 use ratn_model::expression::{EffectExpr, Expr};
 use ratn_model::program::{Exceptions, Nature, Program, State, StateKind, Target, TaskOutput};
 
-/// A line per state, with all that is said about it.
+/// One line per state, with all its annotations.
 pub fn listing(program: &Program) -> String {
     let mut text = format!("horizon {}, width {}", program.horizon, program.speculation_width);
     if program.exceptions == Exceptions::Imprecise {
@@ -68,7 +68,7 @@ fn kind(state: &State) -> String {
     }
 }
 
-/// Everything else that is said about a state.
+/// All annotations of a state.
 fn said(program: &Program, state: &State) -> String {
     let mut said = Vec::new();
     let a = &state.annotations;

@@ -1,17 +1,17 @@
-//! The same program, said with comprehensions: parts of its expressions become the element of a list, with other names for the
-//! elements wherever they stand within each other. Whatever it meant before, it means now.
+//! Rewrites a program with comprehensions: parts of its expressions become elements of a list, with different names for nested
+//! elements. The meaning does not change.
 
 use super::Dice;
 use ratn_model::expression::{Comprehension, Expr};
 use ratn_model::program::Program;
 use ratn_model::value::Value;
 
-/// One part in so many is said so.
+/// One of this many parts is rewritten.
 const EVERY: u64 = 4;
-/// Expressions are not made larger than this; a large one may have no room for more.
+/// Limit of an expression's parts; a larger one is not rewritten.
 const MOST_PARTS: usize = 24;
 
-/// Says parts of the expressions of a program with comprehensions.
+/// Rewrites parts of a program's expressions with comprehensions.
 pub(super) fn say_with_comprehensions(program: &mut Program, dice: &mut Dice) {
     let mut names = 0;
     for state in &mut program.states {
@@ -23,7 +23,7 @@ pub(super) fn say_with_comprehensions(program: &mut Program, dice: &mut Dice) {
                 expr.visit(&mut |part| found |= matches!(part, Expr::Query(_)));
                 found
             };
-            // The conditions of a query are planned by their shape.
+            // Planning depends on the form of a query's conditions.
             if parts <= MOST_PARTS && !in_query(expression) {
                 expression.rewrite(&mut |part| {
                     if dice.below(EVERY) == 0 {
@@ -57,7 +57,7 @@ fn say(part: &mut Expr, name: &str, dice: &mut Dice) {
             let first = fact.arguments[0].replace(element());
             each(what, first.into_iter().collect(), Expr::Exists(fact))
         }
-        // What may be evaluated for no element is not evaluated where it was not, and the other way round.
+        // These parts must be evaluated exactly when they were evaluated before.
         of @ (Expr::Port { .. } | Expr::Variable(_) | Expr::Output(_)) => match dice.below(3) {
             0 => first_of(each(Comprehension::Map, vec![number(0)], of)),
             1 => first_of(each(Comprehension::Filter, vec![of], Expr::Literal(Value::Bool(true)))),

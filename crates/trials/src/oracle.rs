@@ -1,10 +1,10 @@
-//! What the nodes of random programs do: a hash of what they are entitled to see, and nothing else.
+//! The behaviour of nodes in random programs: a hash of what they are entitled to see, and nothing else.
 //!
-//! Faults are keyed by path and attempt, never by time. A PIA that crashes ends `aborted`, which is a result: its crashes are
-//! keyed by path and try, which are the same in both modes. Durations follow from path and try, too. Inside of a preemptive
-//! concurrency the actions of its two regions take multiples of [`LONG_S`] and, in the second, [`SHIFT_S`] more each: with at most
-//! three actions per region, whatever else may shift the end of an action (messages that are late, workers that die: some tens
-//! of seconds) never changes which ends first, so that the outcome is one function of the program in both modes.
+//! Faults depend on path and attempt, never on time. A PIA that crashes ends `aborted`, which is a result, so its crashes depend
+//! on path and try, which are the same in both modes. Durations depend on path and try, too. Inside of a preemptive concurrency
+//! the actions of its two regions take multiples of [`LONG_S`], in the second region plus [`SHIFT_S`] each. With at most three
+//! actions per region, other delays (late messages, crashed workers: some tens of seconds) never change which region ends first,
+//! so the outcome is the same in both modes.
 
 use super::anytime;
 use super::generator::tolerance::{OFF, TOLERANT};
@@ -21,30 +21,30 @@ use ratn_world::world::World;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 
-/// No goal of a random program takes as long, unless it never answers.
+/// Upper limit of a goal's duration, unless it never answers.
 pub(super) const TIMEOUT_S: f64 = 60.0;
-/// What the actions of a preemptive concurrency take, at least.
+/// Smallest duration of actions in a preemptive concurrency.
 pub(super) const LONG_S: f64 = 10_000.0;
-/// And so much more in its second region.
+/// Additional duration in its second region.
 const SHIFT_S: f64 = 3_000.0;
-/// Attempts from this one on do not crash.
+/// Attempts from this number on do not crash.
 const LAST_ATTEMPT: u32 = 3;
-/// Visits from this one on do not lead back.
+/// Visits from this number on do not lead back.
 const LAST_VISIT: u64 = 3;
 
-/// What nodes of random programs do.
+/// The oracle for random programs.
 pub struct HashOracle<'a> {
     /// The program.
     pub program: &'a Program,
-    /// What all hashes are derived from.
+    /// The seed of all hashes.
     pub seed: u64,
-    /// How many of a hundred visits end `aborted`, or `preempted`, or not at all; and PIAs crash.
+    /// Percentage of visits that end `aborted` or `preempted`, or never; also of PIAs that crash.
     pub failures_percent: u64,
-    /// How many of a hundred attempts of computing and sensing nodes kill their worker, or lose their lease.
+    /// Percentage of attempts of computing and sensing nodes that crash or lose their lease.
     pub crashes_percent: u64,
-    /// How many of a hundred effects are not measured as they were predicted.
+    /// Percentage of effects whose measured values differ from the predicted ones.
     pub deviations_percent: u64,
-    /// Whether some of what ends `preempted` ends by an emergency stop instead.
+    /// Whether some of the visits that end `preempted` end by an emergency stop instead.
     pub stops: bool,
 }
 
@@ -117,20 +117,20 @@ impl HashOracle<'_> {
         }
         hash.add_number(goal.seed);
         let usual = 0.5 + hash.dice().below(40) as f64 / 10.0;
-        // Some estimates are right.
+        // Some estimates are exact.
         goal.expected_s.filter(|_| hash.dice().percent(70)).map_or(usual, |expected| expected.min(TIMEOUT_S - 10.0))
     }
 
     fn fault(&self, path: &str, attempt: u32, state: &State, goal: &Goal) -> Option<Answer> {
         if super::around(self.program, state).any(is_preemptive) {
-            // A worker that dies there is waited for by the other regions of the routine, which changes who is first.
+            // The other regions of the routine would wait for the worker's replacement, which could change the winner.
             return None;
         }
         let mut hash = Hash(self.seed);
         hash.add("fault");
         hash.add(path);
         if state.annotations.attempts.is_some() && state.annotations.nature != Nature::Irreversible {
-            // Which attempt is the last is not the same in both modes: none answers, or all do.
+            // The last attempt may have different numbers in the two modes, so either all attempts crash or none.
             hash.add("every attempt");
             hash.add_number(goal.seed);
             return hash.dice().percent(self.crashes_percent).then_some(Answer::Crashed);
@@ -154,13 +154,12 @@ impl HashOracle<'_> {
             return SUCCESS.to_owned();
         }
         let chosen = dice.one_of(&state.outcomes).map_or(SUCCESS, String::as_str);
-        // Cycles end.
+        // Loops in the program must end.
         let back = chosen == AGAIN && (state.annotations.deterministic || visits(path) >= LAST_VISIT);
         if back { FOUND.to_owned() } else { chosen.to_owned() }
     }
 
-    /// Facts that are not as the effects of this outcome say.
-    /// With `x`, its output.
+    /// Facts whose measured values differ from the outcome's effects; `x` is the node's output.
     fn measured(
         &self,
         dice: &mut Dice,
@@ -189,7 +188,7 @@ impl HashOracle<'_> {
                     }
                 }
             }
-            // What it changes nobody could know before.
+            // Undeclared changes, which nobody could predict.
             None if state.annotations.nature == Nature::Irreversible && dice.percent(self.deviations_percent) => {
                 let fact = super::generator::fact_at(dice.below(PREDICATES), dice.below(ARGUMENTS) as i64);
                 measured.extend(key(&fact, &scope).map(|key| (key, Value::Int(dice.below(4) as i64))));
@@ -199,7 +198,7 @@ impl HashOracle<'_> {
         measured
     }
 
-    /// A value of the predicate that has a tolerance: what was predicted or another, and a little beside it.
+    /// A value of the tolerant predicate: the predicted value or another one, with a small deviation.
     fn nearly(&self, dice: &mut Dice, predicted: &Expr, x: i64) -> Option<Value> {
         let predicted = match predicted {
             Expr::Literal(value) => value.as_number()?,
@@ -210,7 +209,7 @@ impl HashOracle<'_> {
         Some(Value::Float(whole + off))
     }
 
-    /// The facts that the node declares to read, sense or require, as the world it was given shows them.
+    /// The facts that the node declares to read, sense or require, as shown by its world.
     fn seen(&self, state: &State, goal: &Goal, world: &World) -> Vec<(String, String)> {
         let scope = InputScope { state, goal };
         let annotations = &state.annotations;
@@ -232,10 +231,10 @@ impl HashOracle<'_> {
     }
 }
 
-/// What a node makes of a value that it sees: of what may be off by a tolerance, the whole number.
+/// What a node sees of a value: for a tolerant predicate the nearest whole number.
 fn coarse(key: &FactKey, value: &Value) -> String {
     match value.as_number().filter(|_| is_tolerant(key)) {
-        // Nothing is below nothing: -0 is 0.
+        // Turns -0 into 0.
         Some(number) => (number.round() + 0.0).to_string(),
         None => value.to_string(),
     }
@@ -257,14 +256,14 @@ fn key(fact: &FactExpr, scope: &InputScope<'_>) -> Option<FactKey> {
     Some(FactKey { predicate: pattern.predicate, arguments })
 }
 
-/// The variables of a node, and the ports that its facts are looked up by: random programs always pass them as inputs.
+/// The variables of a node, and the ports with which it looks up facts: random programs always pass them as inputs.
 pub(super) struct InputScope<'a> {
     pub(super) state: &'a State,
     pub(super) goal: &'a Goal,
 }
 
 impl InputScope<'_> {
-    /// What is passed as an input is known.
+    /// The value of an expression that is passed as an input.
     fn input(&self, expression: &Expr) -> Option<Cow<'_, Value>> {
         let StateKind::Action { inputs, .. } = &self.state.kind else { return None };
         let port = inputs.iter().find(|(_, e)| e == expression).map(|(port, _)| port)?;

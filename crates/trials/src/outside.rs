@@ -1,13 +1,13 @@
-//! The world changes from outside, while a PIA is under way: both modes then do the same.
+//! The world changes from outside while a PIA is under way: both modes must then behave alike.
 //!
-//! When a PIA is under way, everything older is real and nothing younger is, in both modes. So what changes then changes at one place
-//! of the program, and the theorem holds as if the PIA had done it. Beside regions, where others are at places of their own, it
-//! holds as long as what changes is what only the PIA's own region may write: nobody else then reads it either.
+//! When a PIA is under way, in both modes everything older is real and nothing younger is. So a change at that time belongs to one
+//! place of the program, and the theorem holds as if the PIA had made it. With concurrent regions, which are at places of their own,
+//! it holds if only the PIA's own region may write the changed facts, because then no other region reads them.
 //!
-//! - [`trial_from_outside`]: at the start of some PIA, in both modes.
-//! - [`trial_at_any_moment`]: at some time in CDTN mode. Where a PIA was under way then, HSM mode is disturbed at the start of that
-//!   PIA. Where none was, or regions were, there is no place of the program to which the change belongs: the run ends, nothing is
-//!   left over, and no PIA was undone or started twice with the same goal.
+//! - [`trial_from_outside`]: a change at the start of some PIA, in both modes.
+//! - [`trial_at_any_moment`]: a change at some time in CDTN mode. If a PIA was under way then, HSM mode is disturbed at the start of
+//!   that PIA. If none was, or if there are regions, the change belongs to no single place of the program: the run must end, nothing
+//!   may be left over, and no PIA may be undone or started twice with the same goal.
 
 use super::story::story;
 use super::trial::{Conditions, Verdict, compare, execute_under, max_hsm_events, problem};
@@ -23,7 +23,7 @@ use ratn_simulation::run::{Run, RunError, Trigger};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Runs the program in both modes, while some facts become otherwise at the start of one of its PIAs, and compares.
+/// Runs the program in both modes, changes some facts at the start of one of its PIAs, and compares.
 pub fn trial_from_outside(program: &Arc<Program>, conditions: &Conditions) -> Verdict {
     let undisturbed = match execute_under(program, conditions, Mode::Hsm, max_hsm_events(program), Vec::new()) {
         Ok(run) => run,
@@ -47,11 +47,11 @@ pub fn trial_from_outside(program: &Arc<Program>, conditions: &Conditions) -> Ve
     compare(program, conditions, &[(Trigger::Starts(path), event)])
 }
 
-/// Runs the program in CDTN mode, while some facts become otherwise at some time, and compares as far as that is defined.
+/// Runs the program in CDTN mode, changes some facts at some time, and compares as far as that is defined.
 pub(super) fn trial_at_any_moment(program: &Arc<Program>, conditions: &Conditions, undisturbed: &Run) -> Verdict {
     let mut dice = Dice(conditions.seed ^ 0x0000_a117_03e7);
     let facts = facts(undisturbed, &mut dice);
-    // What a condition waits for comes from outside, too, and is no moment of its own.
+    // Changes that fulfil the condition of a wait come from outside, too, at other times.
     let waits = program.states.iter().any(|state| matches!(state.wait(), Some(Wait::Condition(_))));
     if facts.is_empty() || waits || program.states.iter().any(is_preemptive) {
         return Verdict::LeftOut;
@@ -96,17 +96,17 @@ fn under_way(program: &Program, run: &Run) -> Option<String> {
     (acts.acts.iter().filter(|act| act.path == path).count() == 1).then_some(path)
 }
 
-/// What only the region may write in which a PIA is; nothing where it is in none.
+/// The predicates that only the region around a PIA may write; `None` if it is in no region.
 fn own_predicates(program: &Program, path: &str) -> Option<BTreeSet<String>> {
     let state = state_of(program, path)?;
     let chain: Vec<&State> = around(program, state).collect();
     let region = chain.windows(2).find(|pair| matches!(pair[1].kind, StateKind::Concurrency { .. }))?[0];
-    // In a race several regions may write the same.
+    // In a race several regions may write the same facts.
     let races = chain.iter().any(|state| is_preemptive(state));
     Some(if races { BTreeSet::new() } else { weak::written(program, region.id) })
 }
 
-/// A few of the facts that a run wrote, each gone or with what another of its predicate was.
+/// Some facts that a run wrote, each deleted or with the value of another fact of its predicate.
 fn facts(run: &Run, dice: &mut Dice) -> Vec<(FactKey, Option<Value>)> {
     let commits = run.log.iter().filter_map(|line| match &line.entry {
         LogEntry::Command(Command::Commit { changes, .. }) => Some(changes),

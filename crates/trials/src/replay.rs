@@ -1,4 +1,4 @@
-//! A run once more from its log: the same events give the same commands, which is what a run that resumes after a crash lives on.
+//! Replays a run from its log: the same events must give the same commands, because resuming after a crash depends on that.
 
 use ratn_executive::executive::Executive;
 use ratn_executive::protocol::LogEntry;
@@ -7,7 +7,7 @@ use ratn_model::tolerance::Tolerance;
 use ratn_simulation::run::Run;
 use std::sync::Arc;
 
-/// The first command that a fresh executive gives otherwise.
+/// The first command in which a new executive differs from the log.
 pub(super) fn replayed(program: &Arc<Program>, run: &Run) -> Option<String> {
     let mut executive = Executive::new(program.clone(), Tolerance::EXACT);
     let mut again = Vec::new().into_iter();

@@ -1,5 +1,5 @@
-//! Programs with something taken out: every reference to it goes, the numbers of states are made dense again. Names and paths of
-//! what stays are as they were, so that the oracle says the same of it.
+//! Removes a part of a program, with every reference to it, and renumbers the states. Names and paths of the other states do not
+//! change, so the oracle behaves the same for them.
 
 use ratn_model::expression::Expr;
 use ratn_model::id::StateId;
@@ -7,10 +7,10 @@ use ratn_model::program::{Program, StateKind, Target};
 use ratn_model::value::Value;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// The program without a state and what it contains.
+/// The program without a state and its inner states.
 pub(super) fn without(program: &Program, id: StateId) -> Program {
     let mut gone = BTreeSet::from([id]);
-    // What a state contains comes after it.
+    // Inner states have larger ids than the states around them.
     for state in &program.states {
         if state.parent.is_some_and(|parent| gone.contains(&parent)) {
             gone.insert(state.id);
@@ -51,14 +51,14 @@ pub(super) fn without(program: &Program, id: StateId) -> Program {
     next
 }
 
-/// Whether a state is one of those that a retry or a `finally` was made into, which stay as they were made.
+/// Whether a state belongs to an expanded `retry` or `finally`; these are left as they are.
 pub(super) fn is_of_a_guard(program: &Program, id: StateId) -> bool {
     let is_marked = |id: StateId| {
         let annotations = &program.state(id).annotations;
         annotations.again.is_some() || annotations.finally.is_some()
     };
     let parent = program.state(id).parent;
-    // The step out of the condition that counts the tries.
+    // The step that leaves the condition which counts the tries.
     let of_condition = parent.filter(|parent| matches!(program.state(*parent).kind, StateKind::Condition { .. }));
     is_marked(id)
         || parent.is_some_and(is_marked)

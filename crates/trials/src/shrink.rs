@@ -1,5 +1,4 @@
-//! From a program that fails to a small one that still does: states are taken out and annotations simplified, one at a time, as
-//! long as anything can go.
+//! Shrinks a failing program: removes states and simplifies annotations, one at a time, as long as it still fails.
 
 use super::rewrite::{is_of_a_guard, without};
 use super::trial::{Conditions, Verdict, trial};
@@ -10,26 +9,26 @@ use ratn_model::resource::Quantity;
 use ratn_model::value::Value;
 use std::sync::Arc;
 
-/// No more programs than this are tried.
+/// Limit of programs that are tried.
 const MAX_TRIALS: usize = 6_000;
 
-/// What is left.
+/// The shrunk program.
 #[derive(Debug)]
 pub struct Shrunk {
     /// The program.
     pub program: Program,
-    /// What it needs to fail.
+    /// The conditions under which it fails.
     pub conditions: Conditions,
-    /// How it fails.
+    /// The failure.
     pub problem: String,
 }
 
-/// The smallest program found that still fails, maybe in another way.
+/// The smallest program found that still fails, perhaps in another way.
 pub fn shrink(program: Program, conditions: Conditions, problem: String) -> Shrunk {
     shrink_by(trial, program, conditions, problem)
 }
 
-/// The same for another trial.
+/// The same with another trial function.
 pub fn shrink_by(
     trial: fn(&Arc<Program>, &Conditions) -> Verdict,
     program: Program,
@@ -54,7 +53,7 @@ pub fn shrink_by(
             {
                 best = Shrunk { program: Arc::unwrap_or_clone(program), conditions, problem };
                 smaller = true;
-                // What was tried before this step is not tried again before the next round.
+                // The steps before this one are not repeated until the next round.
                 step -= 1;
             }
         }
@@ -64,19 +63,19 @@ pub fn shrink_by(
     }
 }
 
-/// Whether the program is one that there cannot be, as one may be of which a part was taken out.
+/// Whether the failure only shows an invalid program, which can result from removing a part.
 fn is_of_the_reference(problem: &str) -> bool {
     problem.starts_with("the reference does not come to an end")
 }
 
-/// One thing less; steps are numbered, `None` after the last.
+/// The program with one thing less; `None` after the last step.
 fn candidate(best: &Shrunk, step: usize) -> Option<(Program, Conditions)> {
     let states = best.program.states.len();
     let (mut program, mut conditions) = (best.program.clone(), best.conditions.clone());
     if step < states {
-        // From the last to the first, so that the innermost go early; state 0 stays.
+        // From the last to the first, so that inner states are removed early; state 0 stays.
         let id = program.states[states - 1 - step].id;
-        // The regions of a preemptive concurrency go with it or stay: without actions they would end at one moment.
+        // Regions of a preemptive concurrency are removed only with it: without actions they would end at the same moment.
         let held = around(&program, program.state(id)).skip(1).any(is_preemptive);
         let is_whole = program.state(id).annotations.again.is_some() || program.state(id).annotations.finally.is_some();
         let stays = is_of_a_guard(&program, id)
@@ -127,7 +126,7 @@ fn candidate(best: &Shrunk, step: usize) -> Option<(Program, Conditions)> {
     Some((program, conditions))
 }
 
-/// As many ways as there are to simplify a state.
+/// Number of ways to simplify a state.
 const CHANGES: usize = 48;
 
 fn simplify(program: &mut Program, at: usize, what: usize) {
@@ -177,7 +176,7 @@ fn simplify(program: &mut Program, at: usize, what: usize) {
         20..24 => {
             if let StateKind::Action { inputs, .. } = &mut state.kind
                 && what - 20 < inputs.len()
-                // The oracle learns the variables from the inputs.
+                // The oracle knows the variables only from the inputs.
                 && !matches!(inputs[what - 20].1, Expr::Variable(_))
             {
                 inputs.remove(what - 20);

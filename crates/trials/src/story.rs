@@ -1,5 +1,5 @@
-//! What became of a run, in the terms of the safety theorem: which PIAs started and ended when, which instances retired with what,
-//! which changes became real.
+//! The story of a run, in the terms of the safety theorem: which PIAs started and ended when, which instances retired with which
+//! results, which changes became real.
 
 use super::anytime::without_cost;
 use super::{around, compared_as, is_in_routine, is_preemptive, plain, state_of};
@@ -21,7 +21,7 @@ pub(super) struct Act {
     pub(super) running: Vec<usize>,
 }
 
-/// An action that is real.
+/// The result of a retired action.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Real {
     pub(super) outcome: String,
@@ -31,14 +31,14 @@ pub(super) struct Real {
 /// Inputs and outputs.
 type Ports = (BTreeMap<String, Value>, BTreeMap<String, Value>);
 
-/// What went into an action and came out of it.
+/// The inputs and outputs of an action.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Data {
-    /// It failed; why is not compared.
+    /// It failed; the reason is not compared.
     Untold,
     /// Of the last attempt.
     Of(Ports),
-    /// A result was reused, the log does not say which: one of those that were computed at this path.
+    /// A reused result; the log does not tell which: one of those that were computed at this path.
     OneOf(Vec<Ports>),
 }
 
@@ -48,7 +48,7 @@ impl Real {
         Real { outcome, data: data.map_or(Data::Untold, Data::Of) }
     }
 
-    /// Whether both may be the same result.
+    /// Whether both can be the same result.
     pub(super) fn may_be(&self, other: &Real) -> bool {
         let data = match (&self.data, &other.data) {
             (Data::Untold, _) | (_, Data::Untold) => true,
@@ -65,14 +65,14 @@ pub(super) fn goal_text(goal: &Goal) -> String {
     format!("{:x} {:?}", goal.seed, without_cost(&goal.inputs))
 }
 
-/// A run.
+/// The story of a run.
 #[derive(Debug, Default)]
 pub(super) struct Story {
     /// The PIAs' goals, in the order in which they started.
     pub(super) acts: Vec<Act>,
-    /// The actions that retired, by path; what is inside of routines is not told.
+    /// The actions that retired, by path, except those inside of routines.
     pub(super) retired: BTreeMap<String, Vec<Real>>,
-    /// What became real, by predicate, or by fact where there are regions.
+    /// The changes that became real, by predicate, or by fact if there are regions.
     pub(super) changes: BTreeMap<String, Vec<Change>>,
     /// PIAs that were discarded, or computed again, after they had started.
     pub(super) undone: Vec<String>,
@@ -94,7 +94,6 @@ struct Life {
     reused: bool,
 }
 
-/// What the log of a run tells.
 pub(super) fn story(program: &Program, run: &Run) -> Story {
     let mut lives: BTreeMap<InstanceId, Life> = BTreeMap::new();
     let mut running: Vec<usize> = Vec::new();
@@ -127,7 +126,7 @@ pub(super) fn story(program: &Program, run: &Run) -> Story {
                 }
                 Note::Retired { instance } => {
                     if let Some(life) = lives.get(instance).filter(|life| life.tells) {
-                        // Why something failed to begin, or to end, is not compared.
+                        // Reasons of failures are not compared.
                         let data = match life.outcome.as_str() {
                             ABORTED | PREEMPTED | VIOLATED => Data::Untold,
                             _ if life.reused => Data::OneOf(answers.get(&life.path).cloned().unwrap_or_default()),
@@ -142,7 +141,7 @@ pub(super) fn story(program: &Program, run: &Run) -> Story {
                         life.outcome.clear();
                         life.reused = false;
                     }
-                    // Only another region that ended first discards a PIA under way.
+                    // A PIA under way is discarded only if another region has won a race.
                     if let Some(life) = lives.get(instance).filter(|life| life.is_kept && life.started.is_some()) {
                         story.undone.push(life.path.clone());
                     }
@@ -157,7 +156,7 @@ pub(super) fn story(program: &Program, run: &Run) -> Story {
                 life.outputs.clear();
                 life.reused = false;
                 if life.irreversible {
-                    // A try of its own that ended before it.
+                    // An earlier try of the same PIA has ended.
                     running.retain(|act| Some(*act) != life.started);
                     let goal = goal_text(goal);
                     story.acts.push(Act { path: life.path.clone(), goal, running: running.clone() });
@@ -204,7 +203,7 @@ fn is_pia(state: &State) -> bool {
     matches!(state.kind, StateKind::Action { .. }) && state.annotations.nature == Nature::Irreversible
 }
 
-/// Whether two places of the program are in no order: in different regions of one visit of a concurrency.
+/// Whether two places of the program are unordered: in different regions of one visit of a concurrency.
 pub(super) fn are_beside(program: &Program, a: &str, b: &str) -> bool {
     let (mut a, mut b) = (a.split('/'), b.split('/'));
     let mut common = String::new();
@@ -217,7 +216,7 @@ pub(super) fn are_beside(program: &Program, a: &str, b: &str) -> bool {
                 common.push_str(x);
             }
             (Some(x), Some(y)) => {
-                // Two iterations, or two visits, of one state are in order.
+                // Two iterations, or two visits, of one state are ordered.
                 let both = state_of(program, &common);
                 return plain(x) != plain(y)
                     && both.is_some_and(|state| matches!(state.kind, StateKind::Concurrency { .. }));

@@ -1,6 +1,6 @@
-//! One random program in both modes, and whether they did the same: the safety theorem, clause by clause.
+//! Executes one random program in both modes and compares them: the safety theorem, clause by clause.
 //!
-//! A log is in the order of events, so what is checked of every start of a PIA in it holds at every moment of the run.
+//! A log has the order of events, so a check at every start of a PIA in it covers every moment of the run.
 
 use super::awaited::early_signals;
 use super::blind;
@@ -20,68 +20,68 @@ use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// More events in HSM mode than this is a program that is left out.
+/// Limit of events in HSM mode; programs with more are left out.
 pub(super) const MAX_HSM_EVENTS: usize = 6_000;
-/// So many more events than HSM mode may CDTN mode take, which computes what is never needed, too.
+/// CDTN mode may need this many times more events, because it also computes what is never needed.
 pub(super) const MAX_CDTN_EVENTS: usize = 60;
 
 pub(super) fn max_hsm_events(program: &Program) -> usize {
     MAX_HSM_EVENTS * if is_long(program) { 20 } else { 1 }
 }
 
-/// What a program is tried under.
+/// The conditions of a trial.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Conditions {
-    /// What the oracle and all faults are derived from.
+    /// Seed of the oracle and of all faults.
     pub seed: u64,
-    /// Without the theorem's assumptions.
+    /// Whether the theorem's assumptions do not hold.
     pub weak: bool,
-    /// Nothing in the program looks at the world.
+    /// Whether nothing in the program reads the world.
     pub blind: bool,
-    /// Of a hundred visits, how many fail.
+    /// Percentage of visits that fail.
     pub failures_percent: u64,
-    /// Of a hundred attempts, how many crash.
+    /// Percentage of attempts that crash.
     pub crashes_percent: u64,
-    /// Of a hundred effects, how many are measured otherwise.
+    /// Percentage of effects whose measured values differ.
     pub deviations_percent: u64,
-    /// Grants and projections take up to so long.
+    /// Grants and projections take up to this long, in seconds.
     pub latency_s: f64,
-    /// Of a hundred messages, how many come late, twice, or after they were not wanted any more.
+    /// Percentage of messages that arrive late, twice, or after they are no longer wanted.
     pub mischief_percent: u64,
-    /// Somebody pauses, steps and resumes.
+    /// Whether an operator pauses, steps and resumes.
     pub pauses: bool,
-    /// Orders that a look ahead tries.
+    /// Number of orders that look-ahead tries.
     pub orders: usize,
-    /// Of a hundred states, for how many nothing is ever granted.
+    /// Percentage of states whose acquires are never granted.
     pub refused_percent: u64,
-    /// Emergency stops.
+    /// Whether there are emergency stops.
     pub stops: bool,
-    /// After so many events the run is resumed from its log.
+    /// After this number of events the run is resumed from its log.
     pub resume_after: Option<usize>,
-    /// Earlier runs have taught something, right or wrong.
+    /// Whether earlier runs have taught something, right or wrong.
     pub learned: bool,
 }
 
-/// What came of a trial.
+/// The result of a trial.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Verdict {
-    /// Both modes did the same; when they ended, in seconds.
+    /// Both modes did the same; with their ends in seconds.
     Same {
         /// In HSM mode.
         hsm_s: f64,
         /// In CDTN mode.
         cdtn_s: f64,
-        /// PIAs started.
+        /// Number of PIAs started.
         acts: usize,
     },
-    /// Nothing to compare: too long a run.
+    /// Not compared, because the run is too long.
     LeftOut,
-    /// The theorem does not hold: how.
+    /// The theorem does not hold: the difference.
     Differs(String),
 }
 
 impl Conditions {
-    /// Those of a seed.
+    /// The conditions of a seed.
     pub fn of(seed: u64, features: &Features) -> Conditions {
         let mut dice = Dice(seed ^ 0x5eed_c0de);
         let mut some = |chance: u64, much: u64| if dice.percent(chance) { much } else { 0 };
@@ -125,7 +125,7 @@ pub fn trial(program: &Arc<Program>, conditions: &Conditions) -> Verdict {
     compare(program, conditions, &[])
 }
 
-/// The same, while this comes from outside.
+/// The same with these events from outside.
 pub(super) fn compare(program: &Arc<Program>, conditions: &Conditions, outside: &[(Trigger, Event)]) -> Verdict {
     let hsm = match execute_under(program, conditions, Mode::Hsm, max_hsm_events(program), outside.to_vec()) {
         Ok(run) => run,
@@ -152,7 +152,7 @@ pub(super) fn compare(program: &Arc<Program>, conditions: &Conditions, outside: 
     }
 }
 
-/// What either mode did otherwise than the reference says.
+/// The first difference of either mode from the reference.
 fn against_reference(
     program: &Arc<Program>,
     conditions: &Conditions,
@@ -160,7 +160,7 @@ fn against_reference(
     (hsm, cdtn): (&Run, &Run),
     (before, after): &(Story, Story),
 ) -> Option<String> {
-    // What one region does another sees, at what moment ever.
+    // With shared facts, one region depends on the timing of another.
     let shares = conditions.weak && weak::shares(program);
     if shares && !conditions.blind {
         return None;
@@ -175,7 +175,7 @@ fn against_reference(
         return of("HSM", reference::outcomes(&wanted, hsm, before));
     }
     of("HSM", reference::disagreement(program, &wanted, hsm, before)).or_else(|| {
-        // What is beside or behind an imprecise failure is not the prefix of a program.
+        // With an imprecise failure, the world beside and behind it is not that of a prefix of the program.
         match conditions.weak {
             true if weak::fails(hsm) || weak::fails(cdtn) => None,
             true => of("CDTN", reference::end(&wanted, cdtn)),
@@ -195,7 +195,7 @@ pub fn no_verdict(program: &Program, conditions: &Conditions) -> Option<&'static
     }
 }
 
-/// Whether the reference knows a place at which a run, told to end there, does what this one did; `None` where it has no verdict.
+/// Whether the reference, told to end at some place, does what this run did; `None` if it has no verdict.
 pub(super) fn is_cut_somewhere(
     program: &Program,
     conditions: &Conditions,
@@ -218,7 +218,7 @@ pub(super) fn is_cut_somewhere(
     None
 }
 
-/// What the reference says of a program.
+/// The reference's result for a program.
 fn should_be(
     program: &Program,
     conditions: &Conditions,
@@ -247,12 +247,10 @@ fn given<'a>(
     }
 }
 
-/// Parameters are what they are by default.
 fn parameters(program: &Program) -> BTreeMap<String, Value> {
     program.parameters.iter().filter_map(|p| Some((p.name.clone(), p.default.clone()?))).collect()
 }
 
-/// What nodes do under these conditions.
 pub(super) fn oracle<'a>(program: &'a Program, conditions: &Conditions) -> HashOracle<'a> {
     HashOracle {
         program,
@@ -264,7 +262,7 @@ pub(super) fn oracle<'a>(program: &'a Program, conditions: &Conditions) -> HashO
     }
 }
 
-/// One mode's run, to look at.
+/// One run, in one mode, for inspection.
 pub fn execute(
     program: &Arc<Program>,
     conditions: &Conditions,
@@ -274,7 +272,7 @@ pub fn execute(
     execute_under(program, conditions, mode, max_events, Vec::new())
 }
 
-/// A run, and once more from its log.
+/// One run, replayed from its log.
 pub(super) fn execute_under(
     program: &Arc<Program>,
     conditions: &Conditions,
@@ -297,7 +295,7 @@ fn circumstances(program: &Program, conditions: &Conditions) -> Circumstances {
         orders: conditions.orders,
         events: if conditions.pauses { pauses(program, seed) } else { Vec::new() },
         mischief: Mischief { seed, twice_percent: percent, late_percent: percent, crossing_percent: 2 * percent },
-        // Long programs are not examined, which would take minutes.
+        // Long programs are not examined, because that would take minutes.
         checks: if is_long(program) { Checks::Environment } else { Checks::Everything },
         examines: !is_long(program),
         checkpoint_every: (!is_long(program)).then(|| checkpoint_every(seed)),
@@ -332,7 +330,7 @@ fn run_as(
     run_under(setup, &mut oracle(program, conditions), circumstances)
 }
 
-/// States that are never granted anything, by their paths. What is inside of a routine asks for nothing itself, as a rule.
+/// States whose acquires are never granted, by their paths. States inside of a routine usually acquire nothing themselves.
 fn refused(program: &Program, conditions: &Conditions) -> BTreeSet<String> {
     let mut dice = Dice(conditions.seed ^ 0x4ef5ed);
     let mut chosen = |state: &&State| {
@@ -342,7 +340,7 @@ fn refused(program: &Program, conditions: &Conditions) -> BTreeSet<String> {
     program.states.iter().filter(|state| chosen(state)).map(|state| state.path.clone()).collect()
 }
 
-/// What earlier runs may have taught: anything.
+/// Random knowledge from earlier runs.
 fn learned(program: &Program, seed: u64) -> Learned {
     let mut dice = Dice(seed ^ 0x1ea4);
     let mut learned = Learned::default();
@@ -359,13 +357,13 @@ fn learned(program: &Program, seed: u64) -> Learned {
     learned
 }
 
-/// Often, seldom or in between: what is replayed from the log is never interrupted so.
+/// A random interval of checkpoints; the replay from the log uses no checkpoints.
 fn checkpoint_every(seed: u64) -> NonZeroUsize {
     let some = NonZeroUsize::MIN;
     some.saturating_add(Dice(seed ^ 0xc4ec).below(30) as usize)
 }
 
-/// A pause, a step, breakpoints, and what ends them.
+/// A pause, a step, breakpoints, and the events that end them.
 fn pauses(program: &Program, seed: u64) -> Vec<(Trigger, Event)> {
     let mut dice = Dice(seed ^ 0xbea7);
     let mut some = Dice(seed ^ 0xb4ea);
@@ -394,7 +392,6 @@ fn differ(what: &str, hsm: impl std::fmt::Debug, cdtn: impl std::fmt::Debug) -> 
 }
 
 /// The first clause of the theorem that does not hold.
-/// The first clause of the theorem that does not hold.
 pub(super) fn problem(program: &Program, hsm: &Run, cdtn: &Run, stories: &(Story, Story)) -> Option<String> {
     let undone = stories.1.undone.first();
     undone
@@ -402,7 +399,7 @@ pub(super) fn problem(program: &Program, hsm: &Run, cdtn: &Run, stories: &(Story
         .or_else(|| difference(program, hsm, cdtn, stories))
 }
 
-/// The first thing that both modes did not do alike.
+/// The first difference between the modes.
 pub(super) fn difference(program: &Program, hsm: &Run, cdtn: &Run, (before, after): &(Story, Story)) -> Option<String> {
     closure(program, before, after)
         .or_else(|| same_end(hsm, cdtn))
@@ -416,7 +413,7 @@ pub(super) fn difference(program: &Program, hsm: &Run, cdtn: &Run, (before, afte
         .or_else(|| retired(before, after))
 }
 
-/// Outcome, outputs, world and task resources.
+/// Compares outcome, outputs, world and task resources.
 pub(super) fn same_end(hsm: &Run, cdtn: &Run) -> Option<String> {
     let facts = |run: &Run| -> Vec<String> { run.world.iter().map(|(k, f)| format!("{k} = {}", f.value)).collect() };
     if hsm.outcome != cdtn.outcome {
@@ -431,8 +428,8 @@ pub(super) fn same_end(hsm: &Run, cdtn: &Run) -> Option<String> {
     (hsm.units != cdtn.units).then(|| differ("task resources", &hsm.units, &cdtn.units)).flatten()
 }
 
-/// The PIAs started are at every moment some of HSM mode's, each once, with all that come before them in the program started and
-/// ended.
+/// At every moment the PIAs started are a subset of those of HSM mode, each started once, and all PIAs before them in the program
+/// have started and ended.
 pub(super) fn closure(program: &Program, hsm: &Story, cdtn: &Story) -> Option<String> {
     let has_regions = program.states.iter().any(|s| matches!(s.kind, StateKind::Concurrency { .. }));
     let place: BTreeMap<(&str, &str), usize> =
@@ -458,7 +455,7 @@ pub(super) fn closure(program: &Program, hsm: &Story, cdtn: &Story) -> Option<St
     None
 }
 
-/// Per actuator the same PIAs in the same order, but for those of the regions of a preemptive concurrency.
+/// Checks that each actuator has the same PIAs in the same order, except those in regions of a preemptive concurrency.
 fn actuators(program: &Program, hsm: &Story, cdtn: &Story) -> Option<String> {
     let by_actuator = |story: &Story| {
         let mut all: BTreeMap<String, Vec<String>> = BTreeMap::new();
@@ -471,7 +468,7 @@ fn actuators(program: &Program, hsm: &Story, cdtn: &Story) -> Option<String> {
                 all.entry(resource.kind.clone()).or_default().push(act.path.clone());
             }
         }
-        // Of these there are several, or what is had of them are parts: regions may have them in any order.
+        // There are several units of these, or only fractions are used, so regions may use them in any order.
         [super::PART, super::TOOL, super::POWER, super::BATTERY].iter().for_each(|kind| drop(all.remove(*kind)));
         all
     };

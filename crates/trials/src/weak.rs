@@ -1,6 +1,6 @@
-//! What still holds where the theorem's assumptions do not (imprecise exceptions, resources without order, regions that share
-//! facts): every PIA started on a decided path with final inputs and its preconditions true, and the run ends with nothing left
-//! over. The last is checked by the simulation itself, and in every run.
+//! What still holds without the theorem's assumptions (with imprecise exceptions, unordered resources, shared facts): every PIA
+//! started on a decided path with final inputs and true preconditions, and the run ends with nothing left over. The simulation
+//! itself checks the latter, in every run.
 
 use super::reference;
 use super::story::Story;
@@ -18,13 +18,13 @@ pub(super) fn problem(program: &Program, hsm: &Run, cdtn: &Run, (_, told): &(Sto
         return Some(format!("{path} was discarded or computed again after it had started, and it is a PIA"));
     }
     inputs_were_final(program, cdtn).or_else(|| reference::unmet(program, cdtn)).or_else(|| {
-        // Without failures and without shared facts the world is HSM mode's all the same.
+        // Without failures and shared facts the world must still be that of HSM mode.
         let fails = fails(hsm) || fails(cdtn);
         (!fails && !shares(program)).then(|| same_end(hsm, cdtn)).flatten()
     })
 }
 
-/// Whether anything ended `aborted` or `preempted`, in vain or not.
+/// Whether any node ended `aborted` or `preempted`, even if its result was discarded.
 pub(super) fn fails(run: &Run) -> bool {
     run.log.iter().any(|line| {
         matches!(&line.entry, LogEntry::Command(Command::Note(Note::Finished { outcome, .. }))
@@ -32,7 +32,7 @@ pub(super) fn fails(run: &Run) -> bool {
     })
 }
 
-/// Whether regions of a concurrency write facts of each other.
+/// Whether regions of a concurrency write facts that others use.
 pub(super) fn shares(program: &Program) -> bool {
     program.states.iter().any(|state| match &state.kind {
         StateKind::Concurrency { regions, preemptive: false, .. } => {
@@ -73,7 +73,7 @@ fn read(program: &Program, region: StateId) -> BTreeSet<String> {
     all
 }
 
-/// No PIA started with something that was computed again afterwards.
+/// Checks that no PIA started with a value that was computed again afterwards.
 fn inputs_were_final(program: &Program, cdtn: &Run) -> Option<String> {
     let mut states: BTreeMap<InstanceId, (StateId, String)> = BTreeMap::new();
     let mut used: BTreeMap<StateId, Vec<InstanceId>> = BTreeMap::new();
@@ -106,8 +106,8 @@ fn inputs_were_final(program: &Program, cdtn: &Run) -> Option<String> {
     None
 }
 
-/// Whether a path lies in an older iteration of a loop than another: what is there has its outputs from another visit, although the
-/// instances inside of a routine get their numbers late.
+/// Whether a path is in an older iteration of a loop than another one: outputs there belong to another visit, although instances
+/// inside of a routine get their numbers late.
 fn is_in_an_older_iteration(path: &str, other: &str) -> bool {
     let iteration = |segment: &str| -> Option<(String, usize)> {
         let (state, number) = segment.strip_suffix(']')?.split_once('[')?;

@@ -1,5 +1,5 @@
-//! Stable hashes of values, facts and what is read of a world: equal digests mean equal content, on every machine and in every
-//! run (BLAKE3 over an encoding in which nothing can be read two ways: a tag for each kind, a length before each text and list).
+//! Stable hashes of values, facts and what is read of a world: equal digests mean equal content, on every machine and in every run
+//! (BLAKE3 over an unambiguous encoding: a tag for each kind, a length before each text and list).
 
 use crate::world::World;
 use ratn_model::fact::{FactKey, Footprint, Term};
@@ -8,16 +8,16 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt;
 
-/// A hash of content; the default is that of nothing anybody has digested.
+/// A hash of content; the default equals no real digest.
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Digest([u8; 32]);
 
-/// Feeds what is digested to a hash; to BLAKE3 where the digest is to mean the content, on every machine and for ever.
+/// Feeds content to a hash: to BLAKE3 if the digest must identify the content on every machine and for ever.
 #[derive(Debug, Clone, Default)]
 pub struct Digester<H = blake3::Hasher>(H);
 
-/// A hash that bytes can be fed to.
+/// A hash that takes bytes.
 pub trait Feed {
     /// Feeds bytes.
     fn feed(&mut self, bytes: &[u8]);
@@ -29,8 +29,8 @@ impl Feed for blake3::Hasher {
     }
 }
 
-/// A quick hash of 128 bits for what is compared within one process: a memo, not a proof. Two lanes of multiply and rotate, mixed at
-/// the end as SplitMix64 does.
+/// A fast 128-bit hash for comparisons within one process: good enough for a cache, not cryptographic. Two lanes of multiply and
+/// rotate, mixed at the end as in SplitMix64.
 #[derive(Debug, Clone)]
 pub struct Quick {
     lanes: [u64; 2],
@@ -47,7 +47,7 @@ impl Feed for Quick {
         for chunk in bytes.chunks(8) {
             let mut word = [0; 8];
             word[..chunk.len()].copy_from_slice(chunk);
-            // How long the last chunk is counts, too.
+            // The length of the last chunk is part of the hash.
             let word = u64::from_le_bytes(word) ^ ((chunk.len() as u64) << 56);
             let [a, b] = &mut self.lanes;
             *a = (*a ^ word).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(29);
@@ -57,7 +57,7 @@ impl Feed for Quick {
 }
 
 impl Digester<Quick> {
-    /// What has been fed.
+    /// The hash of all bytes fed so far.
     pub fn quick(&self) -> u128 {
         let mix = |mut z: u64| {
             z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -68,7 +68,7 @@ impl Digester<Quick> {
         u128::from(mix(a ^ b.rotate_left(17))) << 64 | u128::from(mix(b ^ a.rotate_left(41)))
     }
 
-    /// Named values, the inputs of an action.
+    /// Feeds named values, such as the inputs of an action.
     pub fn values(&mut self, values: &BTreeMap<String, Value>) {
         self.number(values.len() as u64);
         for (name, value) in values {
@@ -79,7 +79,7 @@ impl Digester<Quick> {
 }
 
 impl Digest {
-    /// Of named values, the inputs of an action.
+    /// The digest of named values, such as the inputs of an action.
     pub fn of_values(values: &BTreeMap<String, Value>) -> Digest {
         let mut digester = Digester::default();
         digester.number(values.len() as u64);
@@ -90,8 +90,8 @@ impl Digest {
         digester.finish()
     }
 
-    /// Of what a world shows through a footprint: which facts were asked for, and which there are. So "nothing matched" has a
-    /// digest, too, and two footprints that happen to show the same have not.
+    /// The digest of what a world shows through a footprint: of the requested facts and of those that exist. So "nothing matched"
+    /// has a digest, too, and different footprints have different digests even if they show the same.
     pub fn of_reads(world: &World, reads: &Footprint) -> Digest {
         let mut digester = Digester::default();
         match reads {
@@ -130,14 +130,14 @@ impl Digest {
 const END: u8 = 255;
 
 impl Digester {
-    /// What has been fed.
+    /// The digest of everything fed so far.
     pub fn finish(&self) -> Digest {
         Digest(*self.0.finalize().as_bytes())
     }
 }
 
 impl<H: Feed> Digester<H> {
-    /// A fact.
+    /// Feeds a fact.
     pub fn fact(&mut self, key: &FactKey, value: &Value) {
         self.text(&key.predicate);
         self.number(key.arguments.len() as u64);
@@ -145,7 +145,7 @@ impl<H: Feed> Digester<H> {
         self.value(value);
     }
 
-    /// A value.
+    /// Feeds a value.
     pub fn value(&mut self, value: &Value) {
         match value {
             Value::Null => self.tag(0),
@@ -202,13 +202,13 @@ impl<H: Feed> Digester<H> {
         }
     }
 
-    /// A text, with its length.
+    /// Feeds a text, after its length.
     pub fn text(&mut self, text: &str) {
         self.number(text.len() as u64);
         self.0.feed(text.as_bytes());
     }
 
-    /// A number.
+    /// Feeds a number.
     pub fn number(&mut self, number: u64) {
         self.0.feed(&number.to_le_bytes());
     }

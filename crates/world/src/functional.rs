@@ -1,4 +1,4 @@
-//! Functional predicates: changes are refused that would give a subject two facts of one.
+//! Functional predicates: refuses changes that would give a subject two facts of such a predicate.
 
 use crate::world::World;
 use ratn_model::fact::{Change, FactKey};
@@ -6,11 +6,11 @@ use ratn_model::ontology::{Ontology, Violation};
 use ratn_model::value::Value;
 
 impl World {
-    /// Whether the ontology allows this world to change so: each change by itself ([`Ontology::check_changes`]), and what holds
-    /// afterwards. Costs the changes. Changes that do not apply are the business of [`World::apply`].
+    /// Whether the ontology allows these changes: each change by itself ([`Ontology::check_changes`]), and the facts that hold
+    /// afterwards. Costs the changes. Changes that cannot be applied are reported by [`World::apply`].
     ///
     /// # Errors
-    /// The rule that is broken first.
+    /// The first violated rule.
     pub fn admits(&self, ontology: &Ontology, changes: &[Change]) -> Result<(), Violation> {
         ontology.check_changes(changes)?;
         let is_functional = |change: &Change| match change {

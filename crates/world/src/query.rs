@@ -1,10 +1,10 @@
-//! Questions about a world: `at(?box) = ?pose, class(?box, SLC), not in_gripper(?box), weight(?box) < 2`.
+//! Queries about a world: `at(?box) = ?pose, class(?box, SLC), not in_gripper(?box), weight(?box) < 2`.
 //!
-//! The language is the one of task files ([`ratn_model::expression::query`] says what a condition means). A [`Query`] is parsed
-//! once, prepared once (planned, and checked against an ontology where there is one), and run as often as wanted, each time
-//! with values for its arguments `$name`. The answers come without duplicates, in the order of the values of the variables, first
-//! that of the text first; so they do not depend on how the query is planned. Everything is bounded: the text, the depth, the
-//! conditions, the facts looked at and the answers.
+//! The language is that of task files ([`ratn_model::expression::query`] defines the conditions). A [`Query`] is parsed once,
+//! prepared once (planned, and checked against an ontology if there is one), and run as often as needed, each time with values
+//! for its arguments `$name`. Answers have no duplicates and are sorted by the values of the variables, in the order of the text;
+//! so they do not depend on the plan. The size of the text, its depth, the conditions, the visited facts and the answers are
+//! bounded.
 
 use crate::world::World;
 use ratn_model::expression::parse::{NameError, Names, ParseError, parse_query};
@@ -20,7 +20,7 @@ use std::cmp::Ordering;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
-/// So many answers may be found before they are put in order and cut to what was asked for.
+/// Limit of answers that are collected before they are sorted and cut to the requested number.
 pub const MAX_ANSWERS: usize = 100_000;
 
 /// A query as written.
@@ -29,7 +29,7 @@ pub struct Query {
     conditions: Vec<Expr>,
 }
 
-/// A query ready to be run.
+/// A prepared query.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Prepared {
     plan: Plan,
@@ -41,53 +41,53 @@ pub struct Prepared {
 pub struct Rows {
     /// The variables, without `?`, in the order of the text.
     pub variables: Vec<String>,
-    /// Their values, one list an answer, in order. A query without variables has one empty answer, or none.
+    /// The answers, sorted, each a list of values. A query without variables has one empty answer, or none.
     pub rows: Vec<Vec<Value>>,
-    /// There are more answers than were asked for.
+    /// Whether there are more answers than requested.
     pub more: bool,
 }
 
-/// A query that has no answer, not even none.
+/// Error: the query could not be answered.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum QueryError {
-    /// Not a query.
+    /// The text is no query.
     #[error("at character {}: {message}{}{help}", .offset + 1, if .help.is_empty() { "" } else { "; " })]
     Syntax {
-        /// Where, in characters from the start.
+        /// The place, in characters from the start.
         offset: usize,
         /// What is wrong.
         message: String,
-        /// What to do; empty where the message says it.
+        /// What to do; empty if the message already tells.
         help: String,
     },
-    /// Not to be answered as it stands.
+    /// The query cannot be planned.
     #[error(transparent)]
     Plan(#[from] PlanError),
-    /// About facts that cannot be.
+    /// The ontology does not allow its facts.
     #[error(transparent)]
     Ontology(#[from] Violation),
-    /// Not all of its arguments were given.
+    /// An argument is missing.
     #[error("the query needs a value for `${name}`")]
     MissingArgument {
-        /// Without `$`.
+        /// Its name without `$`.
         name: String,
     },
-    /// An argument was given that it does not have.
+    /// An argument is unknown.
     #[error("the query has no `${name}`")]
     UnknownArgument {
-        /// Without `$`.
+        /// Its name without `$`.
         name: String,
     },
-    /// A condition that cannot be computed.
+    /// A condition cannot be computed.
     #[error("{0}")]
     Evaluate(EvaluateError),
-    /// It looks at too many facts, or has too many answers.
+    /// It visits too many facts, or has too many answers.
     #[error("{0}")]
     TooLarge(String),
 }
 
 impl Query {
-    /// Reads a query.
+    /// Parses a query.
     ///
     /// # Errors
     /// [`QueryError::Syntax`] with the place.
@@ -101,12 +101,12 @@ impl Query {
         all.map(str::to_owned).collect()
     }
 
-    /// The predicates of the facts that it is about.
+    /// The predicates of its facts.
     pub fn predicates(&self) -> BTreeSet<&str> {
         self.conditions.iter().flat_map(Expr::fact_expressions).map(|fact| fact.predicate.as_str()).collect()
     }
 
-    /// Plans it, and checks it against what facts may say.
+    /// Plans the query, and checks it against an ontology.
     ///
     /// # Errors
     /// [`QueryError::Plan`], [`QueryError::Ontology`].
@@ -138,8 +138,8 @@ impl Prepared {
     /// At most `limit` answers in a world, with values for the arguments (without `$`).
     ///
     /// # Errors
-    /// [`QueryError`] for arguments that are missing or not known, for a condition that cannot be computed, and for a query that
-    /// looks at too much.
+    /// [`QueryError`] if arguments are missing or unknown, if a condition cannot be computed, or if the query visits too many
+    /// facts.
     pub fn run(&self, world: &World, arguments: &BTreeMap<String, Value>, limit: usize) -> Result<Rows, QueryError> {
         if let Some(name) = self.arguments.iter().find(|name| !arguments.contains_key(*name)) {
             return Err(QueryError::MissingArgument { name: name.clone() });
@@ -155,7 +155,7 @@ impl Prepared {
                 return Flow::Enough;
             }
             rows.push(row.to_vec());
-            // All answers to a query without variables are one.
+            // A query without variables has at most one answer.
             if row.is_empty() { Flow::Enough } else { Flow::More }
         })?;
         if too_many {
@@ -185,7 +185,7 @@ impl From<RunError> for QueryError {
     }
 }
 
-/// `$name` is an argument, whatever its name; a query knows no states.
+/// The names in a query: `$name` is an argument; states are unknown.
 struct Arguments;
 
 impl Names for Arguments {

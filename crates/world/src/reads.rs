@@ -1,20 +1,20 @@
-//! Facts that live projections have read, and which projections a commit contradicts.
+//! The facts that live projections have read, and the projections that a commit contradicts.
 //!
-//! A projection shows a base with predicted effects, and what reads it depends on what it showed: on single facts, on the facts
-//! that match a pattern (that none did, too), or on everything. When the root changes, a projection is contradicted where it
-//! would show something else now. What it would show now is the new root with those of its effects that are still to come: the
-//! effects of the writer that commits have come true, and what was predicted of them is compared with what they came to.
+//! A projection shows a base with predicted effects. Its readers depend on what it showed: on single facts, on the facts that match a
+//! pattern (or on their absence), or on everything. When the root changes, a projection is contradicted if it would now show something else.
+//! What it would show now is the new root plus those of its effects that are still expected. The predicted effects of the committing writer
+//! are no longer expected; they are compared with what the writer has really changed.
 //!
 //! ```text
 //! shown   =  base     + effect of a, effect of b        (when it was made)
 //! now     =  new root              + effect of b        (after a's commit)
 //! ```
 //!
-//! [`Live`] finds the projections that read what a commit touches by the patterns that can match a fact, of which a fact of n
-//! arguments has 2ⁿ, and looks at those of one pattern together: where their effects leave a fact alone, all whose bases have the same
-//! version of it show the same. A projection is looked at by itself for the facts that its effects write, for those of which they delete the
-//! pattern, and once when it is contradicted. So a commit costs what it touches and who reads that, not the product of the two. What a
-//! projection has read is not copied: it is the projection, which shares its store with the root.
+//! [`Live`] finds the readers of a changed fact by the patterns that can match it; a fact of n arguments has 2ⁿ. Readers by the same pattern
+//! whose effects do not touch the fact are compared together: all whose bases have the same version of the fact show the same value. A
+//! projection is compared alone for the facts that its effects write or delete by pattern, and once when it is contradicted. So a commit
+//! costs its changes plus their readers, not the product of the two. What a projection has read is not copied: the projection is kept, and
+//! shares its store with the root.
 
 use crate::table::hash_of;
 use crate::world::{Fact as WrittenFact, World, increased, written};
@@ -26,31 +26,31 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Bound;
 use std::sync::Arc;
 
-/// Of a fact with more arguments, every pattern of its predicate is tried instead of those that can match it.
+/// For a fact with more arguments, all patterns of its predicate are tried instead of enumerating those that can match.
 const MAX_ENUMERATED: usize = 6;
 
-/// Projections that something depends on, by an id of the caller.
+/// Live projections, by an id of the caller.
 #[derive(Debug, Clone)]
 pub struct Live<Id> {
     places: BTreeMap<Id, Place>,
-    /// By place; places of ended ones are taken again.
+    /// By place; places of removed projections are reused.
     projections: Vec<Option<(Id, Projection)>>,
     free: Vec<Place>,
-    /// Who has read by a pattern.
+    /// Readers by pattern.
     by_pattern: BTreeMap<FactPattern, Readers>,
     everything: Readers,
-    /// Who waits for a writer's effects, in order.
+    /// By writer, the projections that expect its effects, in order.
     by_writer: BTreeMap<Arc<str>, Vec<Place>>,
-    /// Whose effects write a fact, by its hash, in order.
+    /// By hash of a fact, the projections whose effects write it, in order.
     by_hash: BTreeMap<u64, Vec<Place>>,
-    /// Whose effects delete patterns, in order.
+    /// Projections whose effects delete patterns, in order.
     deleting: Vec<Place>,
 }
 
-/// Where a projection is among the others.
+/// The index of a projection.
 type Place = usize;
 
-/// Who has read by the same pattern: by their bases, in order.
+/// The readers by one pattern: by their bases, in order.
 type Readers = BTreeMap<Revision, Vec<Place>>;
 
 #[derive(Debug, Clone)]
@@ -58,39 +58,39 @@ struct Projection {
     base: Revision,
     shown: World,
     effects: Vec<Predicted>,
-    /// The writers of its effects, and whether theirs have come true.
+    /// The writers of its effects, and whether each has committed.
     writers: Vec<(Arc<str>, bool)>,
-    /// What its effects write, in the order of hashes: all other facts it shows as its base does.
+    /// The facts that its effects write, sorted by hash; it shows all other facts as its base does.
     written: Vec<Written>,
-    /// Whole patterns that its effects delete.
+    /// The patterns that its effects delete.
     deleted: Vec<FactPattern>,
     reads: Footprint,
 }
 
-/// Keys of one hash that the effects of a projection write.
+/// The keys with one hash that the effects of a projection write.
 #[derive(Debug, Clone, Copy)]
 struct Written {
     hash: u64,
-    /// Which effect does.
+    /// The index of an effect that writes one.
     effect: usize,
-    /// No other does, and none deletes anything.
+    /// No other effect does, and none deletes anything.
     alone: bool,
 }
 
 /// An effect of a projection.
 #[derive(Debug, Clone)]
 struct Predicted {
-    /// Of the key that it writes; 0 for a pattern that it deletes.
+    /// Hash of the key that it writes; 0 if it deletes a pattern.
     hash: u64,
-    /// Among the projection's writers.
+    /// Index among the projection's writers.
     writer: Option<usize>,
     change: Change,
 }
 
-/// A predicted change, and who will make it.
+/// A predicted change and its writer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Effect {
-    /// The node, by the path of its instance; `None` where nobody will.
+    /// The writing node, by the path of its instance; `None` if no node will make the change.
     pub writer: Option<Arc<str>>,
     /// What it will change.
     pub change: Change,
@@ -99,13 +99,13 @@ pub struct Effect {
 /// A projection that a commit contradicts.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Contradiction<Id> {
-    /// Which.
+    /// Its id.
     pub projection: Id,
-    /// The first fact, in the order of keys, that it showed and that is otherwise.
+    /// The first differing fact, in the order of keys.
     pub fact: FactKey,
-    /// What it showed; `None`: that there is no such fact.
+    /// The value that it showed; `None`: it showed no such fact.
     pub was: Option<Value>,
-    /// What it would show now.
+    /// The value that it would show now.
     pub is: Option<Value>,
 }
 
@@ -117,18 +117,18 @@ impl<Id> Default for Live<Id> {
 }
 
 impl<Id: Ord + Copy> Live<Id> {
-    /// How many there are.
+    /// Number of live projections.
     pub fn len(&self) -> usize {
         self.places.len()
     }
 
-    /// Whether there is none.
+    /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.places.is_empty()
     }
 
-    /// Adds what was read of `shown`, which is `base` with the effects; one of the same id ends. All bases are revisions of one
-    /// history.
+    /// Adds the reads of the projection `shown`, which is `base` with the effects; replaces one with the same id. All bases are revisions of
+    /// one history.
     pub fn insert(&mut self, id: Id, base: Revision, shown: World, effects: Vec<Effect>, reads: Footprint) {
         self.remove(id);
         let place = self.free.pop().unwrap_or(self.projections.len());
@@ -163,7 +163,7 @@ impl<Id: Ord + Copy> Live<Id> {
         self.places.insert(id, place);
     }
 
-    /// Nothing depends on it any more.
+    /// Removes a projection.
     pub fn remove(&mut self, id: Id) {
         let Some(place) = self.places.remove(&id) else { return };
         let Some((_, projection)) = self.projections[place].take() else { return };
@@ -186,9 +186,9 @@ impl<Id: Ord + Copy> Live<Id> {
         take(&mut self.deleting, place);
     }
 
-    /// The projections that a commit contradicts, in the order of ids. `before` and `after` are the root; `writer` is who
-    /// committed, whose effects are no longer to come. A difference within the tolerance of the predicate is none. Every commit is
-    /// judged by itself: who is told that a projection is contradicted removes it.
+    /// The projections that a commit contradicts, in the order of ids. `before` and `after` are the root; `writer` is the committer, whose
+    /// effects are no longer expected. A difference within the predicate's tolerance does not count. Each commit is judged separately: the
+    /// caller removes a projection that it has been told of.
     pub fn contradicted(
         &mut self,
         before: &World,
@@ -198,11 +198,11 @@ impl<Id: Ord + Copy> Live<Id> {
         tolerance: &dyn Fn(&str) -> Tolerance,
     ) -> Vec<Contradiction<Id>> {
         let mut touched = written(before, changes);
-        // What was written and deleted at once has not changed for anybody; who predicted it is among those who are compared alone.
+        // A fact that the commit both wrote and deleted has changed for nobody; projections that predicted it are compared alone.
         touched.retain(|key| before.fact(key).is_some() || after.fact(key).is_some());
         let mut hashes: Vec<u64> = touched.iter().map(hash_of).collect();
         hashes.sort_unstable();
-        // What was predicted of the writer and did not come is as much a difference as what came.
+        // A predicted change that the writer did not make is a difference, too.
         let alone = self.come_true(writer, before, &hashes);
         let mut found = Found::default();
         for (place, key) in &alone {
@@ -224,7 +224,7 @@ impl<Id: Ord + Copy> Live<Id> {
         found.first.into_values().collect()
     }
 
-    /// Who has to be looked at alone for a fact, in order: its effects may have to do with it.
+    /// The projections that must be compared alone for a fact, in order, because their effects may concern it.
     fn by_themselves(&self, fact: &Fact<'_>) -> Vec<Place> {
         let writing = self.by_hash.get(&fact.hash).into_iter().flatten();
         let deletes = |place: &&Place| {
@@ -237,7 +237,7 @@ impl<Id: Ord + Copy> Live<Id> {
         all
     }
 
-    /// Whether a projection that may have read a fact is contradicted in it.
+    /// Compares one projection for a fact; true if it is contradicted.
     fn compare(
         &self,
         place: Place,
@@ -255,7 +255,7 @@ impl<Id: Ord + Copy> Live<Id> {
         differs
     }
 
-    /// Compares a fact for those who have read it by one pattern and whose effects leave it alone, all of one version of it at once.
+    /// Compares a fact for all readers by one pattern whose effects do not concern it; those with the same version of the fact at once.
     fn compare_together<'a>(
         &'a self,
         pattern: Option<&'a FactPattern>,
@@ -266,14 +266,14 @@ impl<Id: Ord + Copy> Live<Id> {
         found: &mut Found<'a, Id>,
     ) {
         let is_together = |place: &Place| by_themselves.binary_search(place).is_err();
-        // The bases below this one are still to be looked at.
+        // Bases older than this one are still to be compared.
         let mut below = Bound::Unbounded;
         let mut version = fact.before;
         loop {
             let left = found.left.get(&pattern).unwrap_or(readers);
             let Some((newest, places)) = left.range((Bound::Unbounded, below)).next_back() else { return };
             let since = match version.take().filter(|version| version.revision <= *newest) {
-                // Of the root before, unless it was written behind this base.
+                // The version in the root before the commit, unless it was written after this base.
                 Some(version) => Some(version),
                 None => {
                     let Some(place) = places.iter().find(|place| is_together(place)) else {
@@ -310,7 +310,7 @@ impl<Id: Ord + Copy> Live<Id> {
         }
     }
 
-    /// Ends the effects of a writer that were to come; the facts they were to write and a commit of these keys did not.
+    /// The writer's effects are no longer expected. Returns the facts that they were to write and the commit did not.
     fn come_true(&mut self, writer: Option<&str>, before: &World, touched: &[u64]) -> Vec<(Place, FactKey)> {
         let waiting = writer.and_then(|writer| self.by_writer.remove(writer)).unwrap_or_default();
         let mut alone = Vec::new();
@@ -321,7 +321,7 @@ impl<Id: Ord + Copy> Live<Id> {
             for Predicted { hash, change, .. } in projection.effects.iter().filter(|e| e.writer == Some(own)) {
                 match change {
                     Change::Set { fact, .. } | Change::Increase { fact, .. } => {
-                        // One of the same hash may be another: then it is compared once more.
+                        // Hashes may collide; then the fact is only compared once more.
                         if touched.binary_search(hash).is_err() && projection.reads.contains(fact) {
                             alone.push((place, fact.clone()));
                         }
@@ -342,7 +342,7 @@ impl<Id: Ord + Copy> Live<Id> {
         alone
     }
 
-    /// Calls `visit` with each pattern by which a fact was read, and who did.
+    /// Calls `visit` with each pattern by which a fact was read, and its readers.
     fn readers<'a>(&'a self, key: &FactKey, visit: &mut dyn FnMut(&'a FactPattern, &'a Readers)) {
         let arity = key.arguments.len();
         let mut pattern = FactPattern::of(key);
@@ -366,16 +366,16 @@ impl<Id: Ord + Copy> Live<Id> {
     }
 }
 
-/// A fact that is compared.
+/// A fact to compare.
 struct Fact<'a> {
     key: &'a FactKey,
     hash: u64,
-    /// In the root before: it has been so since its revision.
+    /// In the root before the commit: unchanged since the fact's revision.
     before: Option<&'a WrittenFact>,
     now: Option<&'a Value>,
 }
 
-/// Was, is.
+/// Earlier and present value.
 type Difference = (Option<Value>, Option<Value>);
 
 impl<'a> Fact<'a> {
@@ -384,12 +384,12 @@ impl<'a> Fact<'a> {
     }
 }
 
-/// What a commit has been found to contradict so far.
+/// The contradictions of a commit found so far.
 struct Found<'a, Id> {
     first: BTreeMap<Id, Contradiction<Id>>,
-    /// Whom no later fact has to be compared for: facts are looked at in the order of keys.
+    /// Projections that need no further comparison, because facts are compared in the order of keys.
     over: BTreeSet<Place>,
-    /// Who is left of the readers of a pattern (`None`: of everything) of which some are over.
+    /// The remaining readers by a pattern (`None`: readers of everything), for patterns with finished readers.
     left: BTreeMap<Option<&'a FactPattern>, Readers>,
 }
 
@@ -408,7 +408,7 @@ fn add<Id: Ord + Copy>(found: &mut BTreeMap<Id, Contradiction<Id>>, id: Id, fact
     }
 }
 
-/// What a fact was where it is otherwise now.
+/// The difference of the values, beyond the tolerance.
 fn differ(
     fact: &Fact<'_>,
     was: Option<&Value>,
@@ -449,12 +449,12 @@ impl Projection {
         });
     }
 
-    /// Whether one of its effects deletes a fact, if there is one.
+    /// Whether one of its effects may delete this fact.
     fn deletes(&self, key: &FactKey) -> bool {
         self.deleted.iter().any(|pattern| pattern.matches(key))
     }
 
-    /// How what it would show of a fact now differs from what it showed.
+    /// The difference between what the projection would show of a fact now and what it showed.
     fn difference(&self, fact: &Fact<'_>, tolerance: &dyn Fn(&str) -> Tolerance) -> Option<Difference> {
         let differ = |was: Option<&Value>, is: Option<&Value>| differ(fact, was, is, tolerance);
         let written = self.written.binary_search_by_key(&fact.hash, |written| written.hash);
@@ -464,7 +464,7 @@ impl Projection {
             && let effect @ Predicted { change: Change::Set { fact: set, value }, .. } = &self.effects[effect]
             && set == fact.key
         {
-            // What is still to come hides whatever there is now.
+            // An effect that is still expected hides the present value.
             return if is_to_come(effect) { None } else { differ(Some(value), fact.now) };
         }
         let mut own = self.effects.iter().filter(|effect| effect.hash == fact.hash || effect.hash == 0);
@@ -479,7 +479,7 @@ impl Projection {
         for effect in own.by_ref().filter(|effect| is_to_come(effect)) {
             match &effect.change {
                 Change::Set { fact: set, value } if set == fact.key => is = Some(value.clone()),
-                // What cannot be increased fails when it comes true; until then it is as it is.
+                // An increase that cannot be applied will fail later; until then the value stays.
                 Change::Increase { fact: grown, by } if grown == fact.key => {
                     is = increased(grown, is.as_ref(), *by).ok().or(is);
                 }

@@ -1,14 +1,14 @@
 //! The geometric scene, derived from facts.
 //!
-//! `shape(o) = {type: box, size: [x, y, z]}` or `{type: cylinder, radius: r, length: l}` (metres, centred, axis z) gives an
-//! object its shape; `at(o) = pose` puts it into the world; `in_gripper(o) = pose` attaches it to the gripper's tool frame
-//! (then `at(o)`, if any, is ignored). Of a robot with several arms `in_gripper(o, arm) = pose` says whose gripper it is, by the arm's name. `on(o, carrier)` attaches it to what it stands on or in: true, or its pose as seen from the
-//! carrier. What is on a held thing is held with it, where it was on it: between the two `at`, unless the pose is said. The mobile
-//! base stands at `at(base)`, which needs no shape.
+//! `shape(o) = {type: box, size: [x, y, z]}` or `{type: cylinder, radius: r, length: l}` (metres, centred, axis z) gives an object its shape; `at(o) = pose`
+//! places it in the world; `in_gripper(o) = pose` attaches it to the gripper's tool frame (then `at(o)`, if any, is ignored). For a robot with several arms,
+//! `in_gripper(o, arm) = pose` names the arm. `on(o, carrier)` attaches it to the carrier that it stands on or in: the value is true, or its pose relative to
+//! the carrier. An object on a held object is held with it, in the same relative position: that between the two `at`, unless the pose is given. The mobile base
+//! stands at `at(base)`, and needs no shape.
 //!
-//! - [`Scene::of`]: all of it, from a world
-//! - [`live::LiveScene`]: kept up to date with the changes of a world, each costing what it moves
-//! - [`delta::SceneDelta`]: how one scene differs from another, for a reader that has the other
+//! - [`Scene::of`]: makes the whole scene of a world
+//! - [`live::LiveScene`]: follows the changes of a world; each change costs the objects that it moves
+//! - [`delta::SceneDelta`]: the difference between two scenes, for a reader that has the first one
 
 pub mod delta;
 pub mod live;
@@ -22,18 +22,18 @@ use serde::{Deserialize, Serialize};
 /// The individual that names the robot's mobile base.
 pub const BASE: &str = "base";
 
-/// Things stand on things at most this high: more is taken for a circle.
+/// Limit of objects on objects; beyond it, a circle is assumed.
 pub const MAX_STACK: usize = 32;
 
-/// Nothing is larger or farther away, in metres. Planners compute with numbers that hold no more.
+/// Limit of sizes and distances, in metres, because planners compute in numbers of limited range.
 pub const LARGEST_M: f64 = 1e6;
 
-/// Shapes in their places.
+/// The objects with their places.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
-    /// Where the robot's base stands, in the world frame.
+    /// Pose of the robot's base in the world frame.
     pub base: Pose,
-    /// In the order of names.
+    /// The objects, by name.
     pub objects: Vec<SceneObject>,
 }
 
@@ -44,7 +44,7 @@ pub struct SceneObject {
     pub name: String,
     /// Its shape.
     pub shape: Shape,
-    /// Where it is.
+    /// Its place.
     pub placement: Placement,
 }
 
@@ -66,27 +66,27 @@ pub enum Shape {
     },
 }
 
-/// Where an object is.
+/// The place of an object.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Placement {
     /// In the world frame.
     World(Pose),
-    /// Held: as seen from the gripper's tool frame. Of several arms it is the one that is planned for.
+    /// Held: the pose in the gripper's tool frame. With several arms: of the arm that is planned for.
     Gripper(Pose),
-    /// Held by the arm of this name: as seen from its tool frame.
+    /// Held by the arm with this name: the pose in its tool frame.
     Hand {
         /// The arm, as the robot's description names it.
         arm: String,
-        /// In its tool frame.
+        /// The pose in its tool frame.
         pose: Pose,
     },
 }
 
-/// A geometric fact that makes no geometry.
+/// Error: a geometric fact cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SceneError {
-    /// A value of the wrong form.
+    /// The value has the wrong form.
     #[error("{fact} = {value}: expected {expected}")]
     Malformed {
         /// The fact.
@@ -96,7 +96,7 @@ pub enum SceneError {
         /// What it should be.
         expected: &'static str,
     },
-    /// Things that stand on each other, or on more than there can be.
+    /// Objects stand on each other in a circle, or the stack is too high.
     #[error("`{individual}` stands on things in a circle, or on more than {MAX_STACK} of them: see its `on` facts")]
     Circle {
         /// One of them.
@@ -105,7 +105,7 @@ pub enum SceneError {
 }
 
 impl Scene {
-    /// The scene of a world. Objects with a shape but no place are not in it.
+    /// The scene of a world. Objects with a shape but no place are left out.
     ///
     /// # Errors
     /// [`SceneError::Malformed`] where a geometric fact has a value of another form.
@@ -119,7 +119,7 @@ impl Scene {
     }
 }
 
-/// Where the mobile base stands.
+/// The pose of the mobile base.
 fn base(world: &World) -> Result<Pose, SceneError> {
     Ok(pose_of(world, "at", &Term::Name(BASE.to_owned()))?.unwrap_or(Pose::IDENTITY))
 }
@@ -137,7 +137,7 @@ fn object(world: &World, individual: &Term) -> Result<Option<SceneObject>, Scene
     Ok(Some(SceneObject { name: individual.to_string(), shape, placement }))
 }
 
-/// Where an individual is, with what it stands on.
+/// The place of an individual, following the objects that it stands on.
 fn placement(world: &World, individual: &Term, depth: usize) -> Result<Option<Placement>, SceneError> {
     if depth > MAX_STACK {
         return Err(SceneError::Circle { individual: individual.to_string() });
@@ -170,7 +170,7 @@ fn placement(world: &World, individual: &Term, depth: usize) -> Result<Option<Pl
     Ok(at.map(Placement::World))
 }
 
-/// Whose gripper an individual is in, by name, and its pose there: the first in the order of keys.
+/// The arm that holds an individual, and the pose in its tool frame: the first in the order of keys.
 fn hand(world: &World, individual: &Term) -> Result<Option<(String, Pose)>, SceneError> {
     let held = FactPattern { predicate: "in_gripper".to_owned(), arguments: vec![Some(individual.clone()), None] };
     for (key, fact) in world.matching(&held) {
@@ -186,7 +186,7 @@ fn hand(world: &World, individual: &Term) -> Result<Option<(String, Pose)>, Scen
     Ok(None)
 }
 
-/// What an individual stands on (the first in the order of keys), and its pose as seen from there, where that is said.
+/// The carrier of an individual (the first in the order of keys), and its pose relative to the carrier, if given.
 fn carrier(world: &World, individual: &Term) -> Result<Option<(Term, Option<Pose>)>, SceneError> {
     let on = FactPattern { predicate: "on".to_owned(), arguments: vec![Some(individual.clone()), None] };
     for (key, fact) in world.matching(&on) {

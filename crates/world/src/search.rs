@@ -1,24 +1,25 @@
-//! Facts that match any of several patterns, found with a bounded number of looks.
+//! Finds facts that match any of several patterns, visiting a bounded number of facts.
 //!
-//! Each pattern has its candidates in the order of keys; the first of all is taken, as in a merge of sorted lists (Knuth, volume 3, 5.4.1).
+//! Each pattern has its candidates in the order of keys; the smallest key of all is taken, as in a merge of sorted lists (Knuth, volume 3,
+//! 5.4.1).
 
 use crate::world::{Fact, World};
 use ratn_model::fact::{FactKey, FactPattern};
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-/// What looking for facts came to.
+/// The result of a search.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Found {
-    /// The facts that were wanted.
+    /// All wanted facts were found.
     All,
-    /// It would take more looks than it may.
+    /// The limit was reached.
     Unfinished,
 }
 
 impl World {
-    /// Visits the facts that match any of the patterns, in the order of keys, each once, until told to stop. No more than `most` facts are
-    /// looked at, those that do not match included; a fact that two patterns look at counts twice.
+    /// Visits the facts that match any of the patterns, in the order of keys, each once, until `visit` returns false. At most `most` facts
+    /// are examined, including those that do not match; a fact examined for two patterns counts twice.
     pub fn search(
         &self,
         patterns: &[FactPattern],
@@ -27,7 +28,7 @@ impl World {
     ) -> Found {
         let mut left = most;
         let mut candidates: Vec<_> = patterns.iter().map(|pattern| self.merged(pattern)).collect();
-        // The next that matches each pattern; nothing where looking for it takes too much.
+        // The next match of each pattern; `None` if the limit is reached.
         let mut next = |at: usize| -> Option<Option<(&FactKey, &Fact)>> {
             for (key, fact) in candidates[at].by_ref() {
                 left = left.checked_sub(1)?;

@@ -1,11 +1,11 @@
-//! The facts that projections share: one table and two orders of it, all shared between versions.
+//! The facts that projections share: one table and two orders over it, all shared between versions.
 //!
 //! - by key, hashed: a point lookup (`table`);
 //! - by key, ordered, so that a predicate and its leading arguments (the subject) are a range;
 //! - by argument, ordered, so that a predicate and any later argument (the object) are a range, too.
 //!
-//! A clone takes constant time. A write copies the path to it in each of the three (Bagwell's hash tries and B-trees), unless
-//! nobody shares it: only commits pay that, projections write into an overlay of their own (`world`).
+//! A clone takes constant time. A write copies the path to the fact in each of the three (hash tries by Bagwell, B-trees),
+//! unless nobody shares it. Only commits pay for that; projections write into an overlay of their own (`world`).
 
 use crate::table::Table;
 use crate::world::Fact;
@@ -69,14 +69,14 @@ impl Store {
         self.in_order.iter().map(|(key, fact)| (key.as_ref(), fact.as_ref()))
     }
 
-    /// Every fact whose key is greater, in the order of keys.
+    /// Every fact with a greater key, in the order of keys.
     pub(crate) fn iter_behind(&self, key: &FactKey) -> impl Iterator<Item = (&FactKey, &Fact)> {
         let behind = self.in_order.range::<_, FactKey>((Bound::Excluded(key), Bound::Unbounded));
         behind.map(|(key, fact)| (key.as_ref(), fact.as_ref()))
     }
 
-    /// The facts that match, and what the index cannot tell from them, in the order of keys; by the index that narrows most by
-    /// position: a whole key, the leading arguments, a later argument, the predicate.
+    /// The facts that match, together with others that the index cannot separate, in the order of keys. Uses the most
+    /// selective index: the whole key, the leading arguments, a later argument, or the predicate.
     pub(crate) fn candidates<'a>(
         &'a self,
         pattern: &'a FactPattern,
@@ -107,7 +107,7 @@ impl Store {
     }
 }
 
-/// The least key that may match: its leading bound arguments.
+/// The smallest key that may match: its leading bound arguments.
 pub(crate) fn first_of(pattern: &FactPattern) -> FactKey {
     FactKey {
         predicate: pattern.predicate.clone(),

@@ -1,13 +1,13 @@
-//! Facts by key: a flat table that worlds share, and what a world has changed since.
+//! Facts by key: a flat table that worlds share, and the changes of each world since.
 //!
-//! A lookup that misses the caches costs what it misses: one line of the table, in which the key stands as bytes, and one of the
-//! fact. Keys too long for that are compared where they are. The table is open addressing with linear probing and backward
-//! shifts (Knuth, volume 3, 6.4, algorithm R), at most five eighths full.
+//! A lookup that misses the CPU caches costs two cache lines: one of the table, which contains the key as bytes, and one of the fact. Longer keys are
+//! compared in place. The table uses open addressing with linear probing and backward shifts (Knuth, volume 3, 6.4, algorithm R), and is at most five
+//! eighths full.
 //!
-//! The table is in shards, by the first bits of the hash: a shard that grows too large is divided, and nothing but it is touched
-//! (extendible hashing: Fagin, Nievergelt, Pippenger, Strong, ACM TODS 1979). The only owner of a shard writes into it. An owner that shares it writes
-//! beside it, into a persistent hash map of the changes since; when those are an eighth of the shard, the two become a shard of its
-//! own. So a write costs a constant amount, on average, and at most a shard; a clone always costs nothing.
+//! The table is divided into shards, by the first bits of the hash. A shard that grows too large is split without touching the others (extendible
+//! hashing: Fagin, Nievergelt, Pippenger, Strong, ACM TODS 1979). The only owner of a shard writes into it. An owner that shares it writes into a
+//! persistent hash map of changes beside it; when these reach an eighth of the shard, both are merged into a new shard of its own. So a write costs a
+//! constant amount on average, and at most one shard; a clone costs nothing.
 
 use crate::world::Fact;
 use imbl::GenericHashMap;
@@ -18,15 +18,15 @@ use std::sync::Arc;
 
 type Since = GenericHashMap<Arc<FactKey>, Option<Arc<Fact>>, BuildHasherDefault<KeyHasher>, DefaultSharedPtr>;
 
-/// Changes beside a shared table are no reason for one of its own while they are fewer.
+/// Below this number of changes a shared shard is never copied.
 const MIN_SINCE: usize = 512;
-/// A shard with more facts is divided: it is what one write may have to copy.
+/// A shard with more facts is split, because one write may have to copy it.
 const MAX_SHARD: usize = 16_384;
-/// Shards are told apart by so many bits at the most. Beyond, or where hashes are alike on purpose, they grow.
+/// Limit of the hash bits that select a shard. Beyond it, or if hashes collide on purpose, shards grow.
 const MAX_BITS: u32 = 12;
-/// The bytes of a key that stand in the table.
+/// Number of key bytes stored in the table.
 const TEXT: usize = 39;
-/// A key whose bytes do not.
+/// Length value of a key that does not fit.
 const LONG: u8 = u8::MAX;
 
 /// Facts by key.
@@ -38,10 +38,10 @@ pub(crate) struct Table {
 
 #[derive(Debug, Clone, Default)]
 struct Parts {
-    /// Which shard the hashes are in that begin with these bits; none as long as there are no facts.
+    /// By first bits of a hash, the index of its shard; empty while there are no facts.
     directory: Vec<u32>,
     shards: Vec<Shard>,
-    /// How many bits those are.
+    /// Number of these bits.
     bits: u32,
 }
 
@@ -50,18 +50,18 @@ struct Shard {
     flat: Arc<Flat>,
     since: Since,
     len: usize,
-    /// How many of the first bits all its hashes have in common.
+    /// Number of first bits that all its hashes have in common.
     depth: u32,
 }
 
 #[derive(Debug, Clone, Default)]
 struct Flat {
-    /// A power of two of them, or none.
+    /// Empty, or a power of two.
     slots: Vec<Option<Slot>>,
     len: usize,
 }
 
-/// One cache line.
+/// Has the size of one cache line.
 #[derive(Debug, Clone)]
 #[repr(align(64))]
 struct Slot {
@@ -72,7 +72,7 @@ struct Slot {
     text: [u8; TEXT],
 }
 
-/// A key as it is looked for: its bytes, where they are few, and a hash of all of it.
+/// A key to look up: its bytes, if they fit, and its hash.
 struct Wanted {
     hash: u64,
     length: u8,
@@ -88,13 +88,13 @@ impl Table {
         self.get_key_value(key).map(|(_, fact)| fact)
     }
 
-    /// The fact, with the key that it is kept under.
+    /// The fact, with the stored key.
     pub(crate) fn get_key_value(&self, key: &FactKey) -> Option<(&FactKey, &Fact)> {
         let wanted = Wanted::of(key);
         self.parts.shards[self.parts.find(wanted.hash)?].get_key_value(&wanted, key)
     }
 
-    /// Whether the fact is new.
+    /// Inserts a fact; true if it is new.
     pub(crate) fn insert(&mut self, key: &Arc<FactKey>, fact: &Arc<Fact>) -> bool {
         let wanted = Wanted::of(key);
         let parts = Arc::make_mut(&mut self.parts);
@@ -108,7 +108,7 @@ impl Table {
         is_new
     }
 
-    /// Whether the fact was there.
+    /// Removes a fact; true if it was there.
     pub(crate) fn remove(&mut self, key: &Arc<FactKey>) -> bool {
         let wanted = Wanted::of(key);
         let Some(at) = self.parts.find(wanted.hash) else { return false };
@@ -119,7 +119,7 @@ impl Table {
 }
 
 impl Parts {
-    /// Where the shard of a hash is.
+    /// The index of the shard of a hash.
     fn find(&self, hash: u64) -> Option<usize> {
         let first = hash.checked_shr(u64::BITS - self.bits).unwrap_or(0) as usize;
         self.directory.get(first).map(|shard| *shard as usize)
@@ -133,7 +133,7 @@ impl Parts {
         self.find(hash).unwrap_or(0)
     }
 
-    /// Two shards instead of one, by the next bit of their hashes.
+    /// Splits a shard in two, by the next bit of the hashes.
     fn divide(&mut self, at: usize) {
         let depth = self.shards[at].depth;
         if depth == self.bits {
@@ -185,7 +185,7 @@ impl Shard {
         was_there
     }
 
-    /// The shard, to write into: where nobody shares it, or where enough has changed beside it for one of its own.
+    /// The shard for writing: if nobody shares it, or if so much has changed beside it that it is copied now. `None`: write beside it.
     fn own(&mut self) -> Option<&mut Flat> {
         if Arc::get_mut(&mut self.flat).is_none() && self.since.len() < MIN_SINCE.max(self.flat.len / 8) {
             return None;
@@ -200,7 +200,7 @@ impl Shard {
         Some(flat)
     }
 
-    /// Those of its facts whose hashes have a zero behind the first bits, and those with a one.
+    /// Splits its facts by the hash bit after the first `depth` bits.
     fn halves(self, depth: u32) -> (Shard, Shard) {
         let mut halves = [Flat::default(), Flat::default()];
         let mut put = |key: &Arc<FactKey>, fact: &Arc<Fact>| {
@@ -229,14 +229,14 @@ impl Flat {
         self.slots[at].as_ref().map(|slot| (slot.key.as_ref(), slot.fact.as_ref()))
     }
 
-    /// Where a key is, or where it would be.
+    /// The slot of a key, or the slot where it would be inserted.
     fn find(&self, wanted: &Wanted, key: &FactKey) -> Result<usize, usize> {
         if self.slots.is_empty() {
             return Err(0);
         }
         let mask = self.slots.len() - 1;
         let mut at = wanted.hash as usize & mask;
-        // A free slot comes within the table: it is never full.
+        // The table is never full, so a free slot is found.
         loop {
             match &self.slots[at] {
                 None => return Err(at),
@@ -274,7 +274,7 @@ impl Flat {
         loop {
             at = (at + 1) & mask;
             let Some(slot) = &self.slots[at] else { return };
-            // It moves into the gap unless that lies before the place where it is looked for first.
+            // The entry moves into the gap, unless the gap is before its home slot.
             let home = slot.hash as usize & mask;
             if at.wrapping_sub(home) & mask >= at.wrapping_sub(free) & mask {
                 self.slots.swap(free, at);
@@ -322,7 +322,7 @@ impl Wanted {
     }
 }
 
-/// A key as bytes: no two keys have the same.
+/// A key as unambiguous bytes.
 struct Bytes {
     text: [u8; TEXT],
     length: usize,
@@ -343,7 +343,7 @@ impl Bytes {
         Some(())
     }
 
-    /// With its length, which is less than what marks a number.
+    /// Adds a text after its length, which is smaller than the mark of a number.
     fn text(&mut self, text: &str) -> Option<()> {
         let length = u8::try_from(text.len()).ok().filter(|length| *length < LONG)?;
         self.bytes(&[length])?;
@@ -358,15 +358,14 @@ impl Bytes {
     }
 }
 
-/// The hash of a key.
 pub(crate) fn hash_of(key: &FactKey) -> u64 {
     let mut hasher = KeyHasher::default();
     key.hash(&mut hasher);
     hasher.finish()
 }
 
-/// A fixed hash of keys: eight bytes at a time by a rotation and a multiplication, mixed at the end (the finaliser of
-/// `splitmix64`). Not secret: keys that collide on purpose make a lookup slow, and are still told apart.
+/// A fixed hash of keys: eight bytes at a time by a rotation and a multiplication, mixed at the end (the finaliser of `splitmix64`). Not secret: keys
+/// that collide on purpose make a lookup slow, but are still distinguished.
 #[derive(Debug, Default)]
 pub(crate) struct KeyHasher(u64);
 
@@ -421,7 +420,7 @@ mod tests {
     use ratn_model::value::Value;
     use std::collections::{BTreeMap, BTreeSet};
 
-    /// Every third too long for the table, some of numbers.
+    /// Every third key is too long for the table; some consist of numbers.
     fn key(i: u16) -> Arc<FactKey> {
         let name =
             if i.is_multiple_of(3) { format!("a_name_that_is_too_long_for_a_slot_{i}") } else { format!("o{i}") };
@@ -434,7 +433,7 @@ mod tests {
         Arc::new(world.fact(&key(0)).unwrap().clone())
     }
 
-    /// Runs of inserts or removals of neighbouring keys, and what is kept or dropped meanwhile.
+    /// Inserts or removals of neighbouring keys, and which clones are kept or dropped meanwhile.
     fn step() -> impl Strategy<Value = (u16, u16, bool, u8)> {
         (0_u16..3000, 1_u16..800, prop::bool::weighted(0.6), 0_u8..4)
     }

@@ -1,8 +1,8 @@
-//! Facts, and how changes apply to them.
+//! Worlds: facts, and the application of changes.
 //!
-//! A [`World`] is a shared store of facts and an overlay: the changes that only this world has. [`World::project`] writes into the
-//! overlay, so that a projection costs its effects and nothing else; [`World::apply`] writes into the store, so that what is
-//! projected from a root begins with an empty overlay. An overlay that grows beyond [`OVERLAY_LIMIT`] goes into the store, too.
+//! A [`World`] is a shared store of facts and an overlay: the changes of this world only. [`World::project`] writes into the
+//! overlay, so a projection costs only its effects; [`World::apply`] writes into the store, so a projection of a root begins with
+//! an empty overlay. An overlay that grows beyond [`OVERLAY_LIMIT`] is moved into the store, too.
 
 use crate::store::{Store, begins_as, first_of};
 use ratn_model::fact::{Change, FactKey, FactPattern};
@@ -14,46 +14,46 @@ use std::iter::Peekable;
 use std::ops::Bound;
 use std::sync::Arc;
 
-/// As many facts may differ between a projection and the store it shares, before it gets a store of its own.
+/// Limit of an overlay; a projection with more changes gets its own store.
 pub const OVERLAY_LIMIT: usize = 1024;
 
-/// A fact's value, and who wrote it when.
+/// A fact's value, with its writer and revision.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fact {
-    /// What the fact says.
+    /// The value.
     pub value: Value,
-    /// The revision of the world in which it was written.
+    /// The revision of the world that wrote it.
     pub revision: Revision,
-    /// The node that wrote it, by the path of its instance; `None` where nobody said.
+    /// The node that wrote it, by the path of its instance; `None` if unknown.
     pub writer: Option<Arc<str>>,
-    /// What measured it and how sure that is; `None` for what was not measured.
+    /// The measurement, with its certainty; `None` if it was not measured.
     pub measured: Option<Arc<Measurement>>,
 }
 
-/// A world model: the root, or a projection. Cloning shares the store and copies the overlay, which the root has none of.
+/// A world model: the root, or a projection. Cloning shares the store and copies the overlay; a root has no overlay.
 #[derive(Debug, Clone, Default)]
 pub struct World {
     store: Store,
-    /// `None`: the fact does not hold, whatever the store says.
+    /// `None`: the fact does not hold, even if it is in the store.
     overlay: Written,
     revision: Revision,
 }
 
-/// Facts as they are written: `None` is gone. What a list of changes comes to, whatever the changes were.
+/// The result of a list of changes: facts as they are written; `None` is a deleted fact.
 pub type Written = BTreeMap<Arc<FactKey>, Option<Arc<Fact>>>;
 
-/// A change that does not apply; the world is as it was before the whole list of changes.
+/// Error: a change cannot be applied. The world is then unchanged by the whole list of changes.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ChangeError {
-    /// `increase` of a fact that holds something else than a number.
+    /// `increase` of a fact whose value is no number.
     #[error("{fact} is {value}, not a number: it cannot be increased")]
     NotANumber {
-        /// Which fact.
+        /// The fact.
         fact: FactKey,
-        /// What it holds.
+        /// Its value.
         value: Value,
     },
-    /// `increase` beyond what a number can hold.
+    /// The result of `increase` is out of range.
     #[error(
         "{fact} is {value}: increased by {by} it is beyond the range of its numbers (whole numbers from {} to {}, others of finite size); set \
          it to a number with a decimal point, or count from 0 again",
@@ -61,17 +61,17 @@ pub enum ChangeError {
         i64::MAX
     )]
     OutOfRange {
-        /// Which fact.
+        /// The fact.
         fact: FactKey,
-        /// What it holds; null where it holds nothing.
+        /// Its value; null if it is absent.
         value: Value,
-        /// By how much it was to be increased.
+        /// The increment.
         by: f64,
     },
 }
 
 impl World {
-    /// The world in which these facts hold, at a revision; of two for one key the later.
+    /// A world with these facts, at a revision; of two facts with the same key the later one counts.
     pub fn from_facts(facts: impl IntoIterator<Item = (FactKey, Value)>, revision: Revision) -> World {
         let mut store = Store::default();
         for (key, value) in facts {
@@ -80,7 +80,7 @@ impl World {
         World { store, overlay: BTreeMap::new(), revision }
     }
 
-    /// The world of facts that were written before, each with who wrote it when.
+    /// A world of existing facts, with their writers and revisions.
     pub fn of(facts: impl IntoIterator<Item = (Arc<FactKey>, Arc<Fact>)>, revision: Revision) -> World {
         let mut store = Store::default();
         for (key, fact) in facts {
@@ -89,7 +89,7 @@ impl World {
         World { store, overlay: BTreeMap::new(), revision }
     }
 
-    /// The number of commits so far.
+    /// Number of commits so far.
     pub fn revision(&self) -> Revision {
         self.revision
     }
@@ -100,7 +100,7 @@ impl World {
         World { revision, ..self }
     }
 
-    /// How many facts hold; costs the overlay.
+    /// Number of facts that hold; costs the overlay.
     pub fn len(&self) -> usize {
         let mut len = self.store.len();
         for (key, fact) in &self.overlay {
@@ -123,9 +123,9 @@ impl World {
         self.fact(key).map(|fact| &fact.value)
     }
 
-    /// One fact, with who wrote it when.
+    /// One fact, with its writer and revision.
     pub fn fact(&self, key: &FactKey) -> Option<&Fact> {
-        // Most worlds asked are roots: a probe of an empty overlay costs nothing.
+        // Most lookups are in roots, whose overlay is empty and costs nothing to probe.
         match self.overlay.get(key) {
             Some(fact) => fact.as_deref(),
             None => self.store.get(key),
@@ -138,20 +138,20 @@ impl World {
         Merged { below: self.store.iter().peekable(), above: overlay.peekable() }
     }
 
-    /// Every fact whose key is greater, in the order of keys.
+    /// Every fact with a greater key, in the order of keys.
     pub fn iter_behind<'a>(&'a self, key: &'a FactKey) -> impl Iterator<Item = (&'a FactKey, &'a Fact)> {
         let behind = (Bound::Excluded(key), Bound::Unbounded);
         let overlay = self.overlay.range::<FactKey, _>(behind).map(|(key, fact)| (key.as_ref(), fact.as_deref()));
         Merged { below: self.store.iter_behind(key).peekable(), above: overlay.peekable() }
     }
 
-    /// The facts that match, in the order of keys; costs what matches where the whole key, its leading arguments (the subject) or
-    /// one later argument (the object) narrow it.
+    /// The facts that match, in the order of keys. Costs only the matches if the pattern gives the whole key, its leading
+    /// arguments (the subject) or one later argument (the object).
     pub fn matching<'a>(&'a self, pattern: &'a FactPattern) -> impl Iterator<Item = (&'a FactKey, &'a Fact)> {
         self.merged(pattern).filter(|(key, _)| pattern.matches(key))
     }
 
-    /// The facts that match, in the order of keys, and what the index cannot tell from them.
+    /// The facts that match, together with others that the index cannot separate, in the order of keys.
     pub(crate) fn merged<'a>(&'a self, pattern: &'a FactPattern) -> impl Iterator<Item = (&'a FactKey, &'a Fact)> {
         let first = first_of(pattern);
         let bound = first.arguments.len();
@@ -164,8 +164,8 @@ impl World {
         Merged { below: self.store.candidates(pattern).peekable(), above: overlay.peekable() }
     }
 
-    /// Visits the facts that match, in the order of keys, until told to stop, and what the index cannot tell from them: whoever
-    /// counts what is visited knows the cost.
+    /// Visits the facts that match, together with others that the index cannot separate, in the order of keys, until `visit`
+    /// returns false; what is visited is the cost.
     pub fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) {
         if self.overlay.is_empty() {
             self.store.candidates(pattern).all(|(key, fact)| visit(key, &fact.value));
@@ -182,13 +182,13 @@ impl World {
         self.apply_as(None, changes)
     }
 
-    /// As [`World::apply`]; each fact written says that `writer`, a node's path, wrote it.
+    /// As [`World::apply`]; `writer`, a node's path, is stored as the writer of each fact.
     ///
     /// # Errors
     /// As [`World::apply`].
     pub fn apply_as(&mut self, writer: Option<&str>, changes: &[Change]) -> Result<Revision, ChangeError> {
         let writer = writer.map(Arc::<str>::from);
-        // Whoever holds a clone while the store is written makes it copy: so the overlay alone outlives the attempt.
+        // The store is written last: if a clone of the world exists, writing copies the store, so errors must come before.
         let World { overlay, revision, .. } = self.changed(|_| writer.as_ref(), changes)?;
         self.overlay = overlay;
         self.revision = revision;
@@ -196,7 +196,7 @@ impl World {
         Ok(revision)
     }
 
-    /// What [`World::apply_as`] would write on a root, for those who look at it first: [`World::write`] then makes it so.
+    /// What [`World::apply_as`] would write to a root, for callers that examine it first; [`World::write`] then applies it.
     ///
     /// # Errors
     /// As [`World::apply`].
@@ -206,7 +206,7 @@ impl World {
         Ok(self.changed(|_| writer.as_ref(), changes)?.overlay)
     }
 
-    /// The next revision, in which this is written.
+    /// Writes these facts, in a new revision.
     pub fn write(&mut self, written: &Written) -> Revision {
         self.overlay.extend(written.iter().map(|(key, fact)| (Arc::clone(key), fact.clone())));
         self.store_overlay();
@@ -214,7 +214,7 @@ impl World {
         self.revision
     }
 
-    /// The next revision, in which these facts say this, or do not hold.
+    /// Sets or removes these facts, in a new revision.
     pub fn overwrite(&mut self, facts: impl IntoIterator<Item = (FactKey, Option<Value>)>) -> Revision {
         let revision = Revision(self.revision.0 + 1);
         let of = |value| Arc::new(Fact { value, revision, writer: None, measured: None });
@@ -222,7 +222,7 @@ impl World {
         self.write(&written)
     }
 
-    /// What the world will be with the changes applied; costs the changes, not the facts.
+    /// The world after the changes; costs the changes, not the facts.
     ///
     /// # Errors
     /// As [`World::apply`].
@@ -230,8 +230,8 @@ impl World {
         self.project_as(&[], changes)
     }
 
-    /// As [`World::project`]; each fact written says who wrote it: the writer, a node's path, at the place of the change. Empty or
-    /// missing: nobody.
+    /// As [`World::project`]; the writer of each fact, a node's path, is taken from the index of its change. Empty or missing:
+    /// unknown.
     ///
     /// # Errors
     /// As [`World::apply`].
@@ -239,7 +239,7 @@ impl World {
         self.project_looking(writers, changes, |_| {})
     }
 
-    /// As [`World::project_as`]; `look` sees what the changes write.
+    /// As [`World::project_as`]; `look` gets what the changes write.
     ///
     /// # Errors
     /// As [`World::apply`].
@@ -289,7 +289,6 @@ impl World {
         Ok(world)
     }
 
-    /// Moves the overlay into the store.
     fn store_overlay(&mut self) {
         for (key, fact) in std::mem::take(&mut self.overlay) {
             match fact {
@@ -300,14 +299,14 @@ impl World {
     }
 }
 
-/// The same facts, written by the same at the same revisions; how they are shared makes no difference.
+/// Equal if all facts are equal, with their writers and revisions; how they are stored makes no difference.
 impl PartialEq for World {
     fn eq(&self, other: &World) -> bool {
         self.revision == other.revision && self.iter().eq(other.iter())
     }
 }
 
-/// Two orders as one: of equal keys the one above holds.
+/// Merges two ordered sequences; for equal keys `above` wins.
 struct Merged<B: Iterator, A: Iterator> {
     below: Peekable<B>,
     above: Peekable<A>,
@@ -347,10 +346,10 @@ pub(crate) fn written(before: &World, changes: &[Change]) -> BTreeSet<FactKey> {
     keys
 }
 
-/// What `increase` makes of a value; an absent one counts as 0. Whole numbers stay whole.
+/// The result of `increase`; an absent value counts as 0. Whole numbers stay whole.
 ///
 /// # Errors
-/// [`ChangeError`] for what is no number, and for what is beyond the range of numbers.
+/// [`ChangeError`] if the value is no number, or if the result is out of range.
 pub fn increased(fact: &FactKey, old: Option<&Value>, by: f64) -> Result<Value, ChangeError> {
     let beyond = || {
         let value = old.cloned().unwrap_or(Value::Null);
@@ -371,7 +370,7 @@ pub fn increased(fact: &FactKey, old: Option<&Value>, by: f64) -> Result<Value, 
     }
 }
 
-/// A whole number as one, where it is in range. The ends of the range are powers of two, so they are exact.
+/// A whole number as an int, if it is in range. The limits of the range are powers of two, so they are exact as floats.
 fn as_whole(x: f64) -> Option<i64> {
     (x >= i64::MIN as f64 && x < -(i64::MIN as f64)).then_some(x as i64)
 }

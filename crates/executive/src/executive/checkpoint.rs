@@ -1,31 +1,32 @@
-//! A checkpoint: the whole state of an executive as bytes, so that a run resumes from it without its log before.
+//! A checkpoint: the whole state of an executive as bytes, so that a run resumes without the log before it.
 //!
-//! An executive that is restored gives the same commands for the same further events, to the last bit. What that takes:
+//! A restored executive gives exactly the same commands for the same further events. That needs:
 //!
 //! | in it | why |
 //! |---|---|
-//! | the mirror of the root, with the revisions of its facts | what is read, and what a commit is numbered |
-//! | the instances with their places, outputs, waits and urgency | who goes on when, and is asked for with which priority |
-//! | forecasts, with what readers were shown of them before, and their users | a forecast that changed within its tolerance is not made again: who is told of what, and what is predicted, follows from what it *was* |
-//! | what facts were before somebody changed them within their tolerance | as above, of changes from outside |
-//! | estimated durations and paths | they are made when the window has grown enough, and stand until then |
-//! | signals that no wait has taken | the next wait of their name takes them |
-//! | results that were discarded | they serve again |
-//! | results that get better, with the best so far and what their goals hold | they are given to motions, and what they hold goes back |
-//! | the queue, timers, cursors, branches, lines, the interpreters with their threads | where everything is |
-//! | what is still to be done of a run that was told to end | it ends after that |
+//! | the mirror of the root, with the revisions of its facts | reads, and the numbers of commits |
+//! | the instances with their places, outputs, waits and urgency | which instance goes on when, and the priority of its acquire |
+//! | forecasts, with the earlier versions that readers were shown, and their users | a forecast that changed within its tolerance is not made again: notifications and predictions follow from its *earlier* value |
+//! | earlier values of facts that somebody changed within their tolerance | the same, for changes from outside |
+//! | estimated durations and paths | they are made when the window has grown enough, and hold until then |
+//! | signals that no wait has taken | the next wait for their name takes them |
+//! | discarded results | the result cache may use them again |
+//! | results that are still being improved, with the best so far and what their goals hold | motions use them, and their leases are given back |
+//! | the queue, timers, cursors, branches, lines, the interpreters with their threads | the place of everything |
+//! | the remaining way out of a run that was told to end | the run ends after it |
 //!
 //! | not in it | because |
 //! |---|---|
-//! | the plan | it follows from the program. Its fingerprint is there: a checkpoint fits no other program and no other catalogue |
-//! | the sums of hashes of the root's facts | whoever asks makes them of the root, the same ones |
-//! | how deep forecasts are within each other, how far an event's commands have been looked through | nothing, between two events |
+//! | the plan | it follows from the program. The checkpoint has its fingerprint: it fits no other program and no other catalogue |
+//! | the sums of hashes of the root's facts | they are recomputed from the root, with the same result |
+//! | the depth of nested forecasts, how far an event's commands have been followed | zero between two events |
 //!
-//! What several share is written once and shared again (`window/growth/environment/checkpoint.rs`). The mirror's facts have no writers and
-//! no measurements, those of the world pool have. A world that a routine works on is written as its difference from the root.
+//! Values that several owners share are written once and shared again (`window/growth/environment/checkpoint.rs`). The mirror's facts have
+//! no writers and no measurements; the world pool's facts have them. A world that a routine works on is written as its difference from the
+//! root.
 //!
-//! The bytes: a version, a BLAKE3 hash of the rest, and the rest in postcard, which keeps floats to the last bit. Bytes that are torn,
-//! damaged, of another version or of another program are refused before anything of them is used.
+//! The bytes: a version, a BLAKE3 hash of the rest, and the rest in postcard, which keeps floats exactly. Bytes that are torn, damaged, of
+//! another version or of another program are refused before any of them is used.
 
 use super::{Executive, State};
 use crate::plan::Plan;
@@ -42,7 +43,7 @@ use serde::{Deserialize, Serialize};
 use std::fmt::{self, Write};
 use std::sync::Arc;
 
-/// The version of the form. Any change of what is written takes a new number: no version reads another's.
+/// Version of the format. Any change of what is written takes a new number: no version reads another's.
 const FORMAT: u8 = 10;
 
 type Hash = [u8; blake3::OUT_LEN];
@@ -56,23 +57,23 @@ pub enum RestoreError {
         /// Its first byte.
         found: u8,
     },
-    /// Bytes are missing, too many, or otherwise than they were written.
+    /// The bytes are truncated, too long or damaged.
     #[error("it is torn or damaged")]
     Torn,
-    /// It is whole, and of something else.
+    /// It is intact, but belongs to another program.
     #[error("it is of another program, or the catalogue was another one")]
     OtherProgram,
-    /// It was written so, and makes no sense.
+    /// The bytes are intact, but their content is inconsistent.
     #[error("it contradicts itself: {0}")]
     Broken(String),
 }
 
-/// All but the root and the window's places.
+/// Everything but the root and the window's places.
 #[derive(Serialize, Deserialize)]
 struct Form<F, S, B> {
     program: Hash,
     revision: Revision,
-    /// The root's.
+    /// The facts of the root.
     facts: Vec<F>,
     last_instance: u64,
     seed: u64,
@@ -83,7 +84,7 @@ struct Form<F, S, B> {
 }
 
 impl Executive {
-    /// The whole state. An executive that is restored from it gives the same commands for the same further events.
+    /// The whole state as bytes. An executive restored from them gives the same commands for the same further events.
     pub fn checkpoint(&self) -> Vec<u8> {
         let facts = self.root.iter().map(|(key, fact)| (key, &fact.value, fact.revision)).collect();
         let body = self.body(facts);
@@ -94,10 +95,10 @@ impl Executive {
         bytes
     }
 
-    /// An executive as it was at a [`Executive::checkpoint`].
+    /// Restores an executive from a [`Executive::checkpoint`].
     ///
     /// # Errors
-    /// Where the bytes are torn or damaged, or of another version or another program.
+    /// The bytes are torn, damaged, of another version or of another program.
     pub fn restore(program: Arc<Program>, tolerance: Tolerance, bytes: &[u8]) -> Result<Executive, RestoreError> {
         let (format, rest) = bytes.split_first().ok_or(RestoreError::Torn)?;
         if *format != FORMAT {
@@ -110,7 +111,7 @@ impl Executive {
         Executive::new(program, tolerance).with_body(body, World::of)
     }
 
-    /// Another executive that is like this one, by way of a checkpoint, but for the root, of which it has a copy.
+    /// A copy of this executive, made through a checkpoint; only the root is cloned directly.
     pub(super) fn copy(&self) -> Result<Executive, RestoreError> {
         let new = Executive {
             program: self.program.clone(),
@@ -137,7 +138,7 @@ impl Executive {
         let (last_instance, seed, deadline) = (*last_instance, *seed, *deadline);
         let signals = signals.clone();
         let form = Form { program, revision, facts, last_instance, seed, signals, deadline, state, beside };
-        // Everything has a form that can be written; there is no I/O.
+        // Serialization cannot fail: everything has a form, and there is no I/O.
         postcard::to_extend(&form, Vec::new()).unwrap_or_default()
     }
 
@@ -147,7 +148,7 @@ impl Executive {
         root: impl FnOnce(Vec<(Arc<FactKey>, Arc<Fact>)>, Revision) -> World,
     ) -> Result<Executive, RestoreError> {
         let broken = |reason: &str| RestoreError::Broken(reason.to_owned());
-        // Before the rest: the form of another program may be read otherwise.
+        // The program is checked first: the form of another program may not be readable.
         let (program, _): (Hash, _) = postcard::take_from_bytes(body).map_err(|error| broken(&error.to_string()))?;
         if program != self.fingerprint() {
             return Err(RestoreError::OtherProgram);
@@ -174,7 +175,7 @@ impl Executive {
         Ok(self)
     }
 
-    /// Of the program and of what follows from it, with the catalogue.
+    /// Fingerprint of the program, its plan and the catalogue.
     fn fingerprint(&self) -> Hash {
         *self.fingerprint.get_or_init(|| fingerprint(&self.program, &self.plan))
     }
@@ -182,12 +183,12 @@ impl Executive {
 
 fn fingerprint(program: &Program, plan: &Plan) -> Hash {
     let mut hasher = Hashing(blake3::Hasher::new());
-    // It writes into memory only.
+    // It writes into memory only, so it cannot fail.
     let _ = write!(hasher, "{} {} {plan:?}", program.name, program.digest);
     *hasher.0.finalize().as_bytes()
 }
 
-/// What is written is hashed.
+/// A writer that hashes what is written.
 struct Hashing(blake3::Hasher);
 
 impl Write for Hashing {

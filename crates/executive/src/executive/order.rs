@@ -2,21 +2,21 @@
 //!
 //! ```text
 //! in the order of the program   commits, operations, goals …
-//! then                          acquires, the most urgent first: what is free goes to whom it serves most
-//! then                          releases: the same for what becomes free
+//! then                          acquires, the most urgent first: free resources go to the instance that needs them most
+//! then                          releases: likewise for what they free
 //! ```
 //!
-//! The resource manager grants as requests arrive; it cannot know what comes next. Where something is deleted or used up it is the other way
-//! round: what is given back may be that, and nobody is granted what the program has removed before. There a release is performed
+//! The resource manager grants as requests arrive; it cannot know what comes next. If something is deleted or consumed, the order is reversed: a
+//! release may give back that very resource, and nobody may be granted what the program has removed before. A release is then performed
 //!
 //! - never before a commit of its own instance;
-//! - before the removal that it follows, where nothing is committed in between;
-//! - else before the removal that follows it, or before the acquires where none does.
+//! - before the removal that precedes it, if there is no commit in between;
+//! - else before the next removal, or, if there is none, before the acquires.
 //!
-//! A goal is told to stop before what it was given is given back: a cancellation goes before the removal that it follows, too, where nothing is
-//! committed in between.
+//! A goal is cancelled before its resources are given back. So a cancellation, too, goes before the removal that precedes it, if there is no commit
+//! in between.
 //!
-//! A commit stays behind the removals that it follows in the program: where one of these is refused, nothing behind it becomes real.
+//! A commit stays behind the removals that precede it in the program: if one of these is refused, nothing behind it becomes real.
 
 use crate::protocol::Command;
 use ratn_model::id::InstanceId;
@@ -24,10 +24,10 @@ use ratn_model::resource::{Requirement, ResourceOperation};
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
-/// Where a command stands: its part, its place in the program, its turn among those that have the same one, and its priority.
+/// The place of a command: its part, its position in the program, its turn among commands with the same position, and its priority.
 type Place = (u8, usize, Turn, Reverse<i64>);
 
-/// Before what has a place of its own, goals are told to stop, and then what they held is given back.
+/// Order of commands moved to another command's place: cancellations, then releases, then that command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Turn {
     Stop,
@@ -35,7 +35,7 @@ enum Turn {
     Own,
 }
 
-/// The commands of one event as they are performed. What one event both asked for and withdrew is not asked for.
+/// The commands of one event in the order in which they are performed. An acquire that the same event also withdraws is dropped.
 pub(super) fn in_order(commands: Vec<Command>) -> Vec<Command> {
     let asks = |c: &Command| matches!(c, Command::Acquire { .. } | Command::Withdraw { .. } | Command::Release { .. });
     if !commands.iter().any(asks) {
@@ -62,7 +62,7 @@ pub(super) fn in_order(commands: Vec<Command>) -> Vec<Command> {
     ordered.into_iter().map(|(_, command)| command).collect()
 }
 
-/// The number of the command that a release goes before, beside removals.
+/// Number of the command before which a release goes, if the event has removals.
 fn release(commands: &[Command], number: usize, instance: InstanceId) -> usize {
     let is_own = |command: &Command| matches!(command, Command::Commit { instance: of, .. } if *of == instance);
     let own = commands.iter().rposition(is_own).filter(|own| *own > number);
@@ -103,7 +103,7 @@ fn removes(command: &Command) -> bool {
     removed(command).next().is_some()
 }
 
-/// What a command deletes or uses up.
+/// The resources that a command deletes or consumes.
 pub(crate) fn removed(command: &Command) -> impl Iterator<Item = &Requirement> {
     let operations = match command {
         Command::Operate { operations, .. } => operations.as_slice(),
@@ -117,8 +117,8 @@ mod tests {
     use super::*;
     use ratn_model::id::{LeaseId, Revision};
 
-    /// Commands by a letter and the number of an instance: `c` commits, `d` deletes, `n` creates, `r` gives back, `a` asks (the lower the number the
-    /// more urgent), `w` withdraws, `x` stops a goal, `e` ends.
+    /// Builds a command from a letter and the number of an instance: `c` commits, `d` deletes, `n` creates, `r` releases, `a` acquires (a lower
+    /// number is more urgent), `w` withdraws, `x` cancels a goal, `e` ends.
     fn command(said: &str) -> Command {
         let number = said[1..].parse().unwrap_or(0);
         let instance = InstanceId(number);
@@ -169,7 +169,7 @@ mod tests {
 
     #[test]
     fn what_a_state_holds_goes_back_before_something_is_deleted_at_its_end_and_behind_its_effects() {
-        // As the window says it, and as the interpreter does.
+        // In the order of the window, and in that of the interpreter.
         check("r1 c1 d1 a2", "c1 r1 d1 a2");
         check("c1 d1 r1 a2", "c1 r1 d1 a2");
         check("c1 d1 d1 r1", "c1 r1 d1 d1");

@@ -1,4 +1,4 @@
-//! Repeated tries of an action: retries and their pauses, timeouts, workers that die.
+//! Repeated tries of an action: retries with backoff, timeouts, crashed workers.
 //!
 //! A cancelled or crashed goal changes nothing, because it is not known how far it came.
 
@@ -13,7 +13,7 @@ use ratn_model::program::{ABORTED, Program, StateKind};
 use ratn_model::resource::ResourceOperation;
 
 impl Interpreter {
-    /// Pauses between tries that are over, and goals that have had their time.
+    /// Handles what is due: backoffs that are over, and goals that have reached their timeout.
     pub(super) fn look_at_the_time(&mut self, context: &mut Context<'_>) -> Progress {
         let all: Vec<u64> = self.threads.keys().copied().collect();
         for thread in all {
@@ -23,7 +23,7 @@ impl Interpreter {
                 Phase::Backoff(until) if until <= context.now => self.next_try(context, thread),
                 Phase::Running if current.timeout.is_some_and(|at| at <= context.now) => {
                     if context.program.state(current.state).is_pause() {
-                        // What has ended already goes on first: who has lost a race by that takes no signal any more.
+                        // Regions that have ended go on first: a wait that has lost a race takes no signal any more.
                         let progress = self.advance(context);
                         if progress != Progress::Busy {
                             return progress;
@@ -45,14 +45,14 @@ impl Interpreter {
         Progress::Busy
     }
 
-    /// A goal has ended: that is the result, unless it is tried again.
+    /// A goal has ended: finishes the node with its result, unless it is tried again.
     pub(super) fn goal_ended(&mut self, context: &mut Context<'_>, thread: u64, end: GoalEnd) {
         if end.outcome != ABORTED || !self.is_tried_again(context, thread, false) {
             self.finish(context, thread, end);
         }
     }
 
-    /// After a try that ended `aborted`, or whose worker died: whether there is another one, which begins after its pause.
+    /// After a try that ended `aborted` or whose worker died: starts the backoff before the next try. False if there is no further try.
     fn is_tried_again(&mut self, context: &mut Context<'_>, thread: u64, has_died: bool) -> bool {
         let Some(current) = self.current(thread) else { return false };
         let retry = context.program.state(current.state).annotations.retry;
@@ -73,7 +73,7 @@ impl Interpreter {
         true
     }
 
-    /// The pause before a try is over.
+    /// The backoff is over: begins the next try.
     fn next_try(&mut self, context: &mut Context<'_>, thread: u64) {
         let Some(current) = self.current(thread) else { return };
         if std::mem::take(&mut current.has_died) {
@@ -83,8 +83,8 @@ impl Interpreter {
         }
     }
 
-    /// An attempt ended without an answer: a computing or sensing node is tried again, up to its limit. What is behind that limit, and any PIA, counts as
-    /// one that ended `aborted`.
+    /// An attempt ended without an answer. A computing or sensing node is tried again, up to its limit. Beyond the limit, and for a PIA, it counts as a
+    /// try that ended `aborted`.
     pub(super) fn crashed(&mut self, context: &mut Context<'_>, thread: u64, reason: &str, unknown: bool) {
         let Some(current) = self.current(thread) else { return };
         let (attempt, id) = (current.attempt, current.state);
@@ -92,7 +92,7 @@ impl Interpreter {
             Phase::Projecting | Phase::Running | Phase::Acquiring => {}
             Phase::Backoff(_) | Phase::Stalled | Phase::Queued(_) => return,
             Phase::Held => {
-                // It had not begun: what it held is gone, and it asks again when it may.
+                // The node had not begun. Its lease or projection is gone; it asks again when it may begin.
                 let given = current.take_held();
                 current.attempt += 1;
                 return self.give_back(context, &given);
@@ -102,7 +102,7 @@ impl Interpreter {
         let limit = context.program.state(id).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
         let is_irreversible = context.plan.state(id).nature == NodeNature::Irreversible;
         if is_irreversible || current.crashes >= limit {
-            // Who may have moved does not move once more.
+            // A motion that may have been performed is not repeated.
             if is_irreversible && unknown || !self.is_tried_again(context, thread, true) {
                 self.end_node(context, thread, format!("crashed in attempt {attempt}: {reason}"));
             }
@@ -114,14 +114,14 @@ impl Interpreter {
         self.try_anew(context, thread);
     }
 
-    /// Its worker died: it begins again with other resources, in a routine when that has all of its own anew.
+    /// Begins again after the worker died, with other resources; inside of a routine, when the routine has a new lease.
     fn try_anew(&mut self, context: &mut Context<'_>, thread: u64) {
         let Some(current) = self.current(thread) else { return };
         let id = current.state;
         current.phase = Phase::Stalled;
         match self.threads.get(&thread).and_then(|thread| thread.routine) {
             Some(_) if !self.may_try(context, thread) => {}
-            // In a race who waits loses: the others keep the lease, and what is left of it has to do.
+            // A node that waits loses its race, so it goes on with what is left of the lease.
             Some(routine) if self.uses_lease(context.program, routine) && is_in_race(context.program, id) => {
                 self.project_or_run(context, thread);
             }
@@ -130,8 +130,8 @@ impl Interpreter {
         }
     }
 
-    /// A worker of a routine has died and nothing of it moves under the old lease any more: it gives everything back and asks for
-    /// all of it again.
+    /// A worker of a routine has died: as soon as nothing of the routine uses its old lease, the routine releases it and acquires all of its resources
+    /// again.
     pub(super) fn renew_leases(&mut self, context: &mut Context<'_>) {
         let all: Vec<u64> = self.routines.keys().copied().collect();
         for routine in all {
@@ -143,7 +143,7 @@ impl Interpreter {
         if self.uses_lease(context.program, routine) {
             return;
         }
-        // Who waits for a turn asks, too, where whoever has asked was cut short, or pauses while it has the unit whose worker died.
+        // A queued thread asks, too: the thread that had asked may have been cut short, or may be in backoff with the unit whose worker died.
         let is_away =
             self.routines.get(&routine).is_some_and(|one| one.lease.is_none() && !one.requirements.is_empty());
         let has_died = is_away || self.currents_of(routine).any(Current::lost_its_worker);
@@ -155,7 +155,7 @@ impl Interpreter {
         if let Some(lease) = one.lease.take() {
             context.commands.push(Command::Release { instance, lease: Some(lease.id), projection: None });
         }
-        // What its first lease has used up is used up for all of it.
+        // What the first lease consumed stays consumed for the whole routine.
         one.requirements.retain(|required| required.operation != ResourceOperation::Consume);
         let requirements = one.requirements.clone();
         self.know_of_new_lease(routine);
@@ -166,7 +166,7 @@ impl Interpreter {
         context.commands.push(Command::Acquire { instance, requirements, priority: i64::MAX });
     }
 
-    /// Whoever pauses before its next try finds other resources than those with which its worker died.
+    /// Threads in backoff get the new lease at their next try, not the one whose worker died.
     fn know_of_new_lease(&mut self, routine: u64) {
         let threads: Vec<u64> = self.threads_of(routine).collect();
         for thread in threads {
@@ -176,7 +176,7 @@ impl Interpreter {
         }
     }
 
-    /// Who has asked for the routine goes on, and whoever waited with it, unless what they require has been changed meanwhile.
+    /// The routine has its new lease: the thread that asked and the stalled ones go on, unless their preconditions no longer hold.
     pub(super) fn go_on_under_new_lease(&mut self, context: &mut Context<'_>, thread: u64) {
         let routine = self.threads.get(&thread).and_then(|thread| thread.routine);
         let stalled = routine.map(|routine| self.stalled(routine)).unwrap_or_default();
@@ -187,10 +187,10 @@ impl Interpreter {
         }
     }
 
-    /// Whether anything of a routine moves under its lease, or asks for it.
+    /// Whether a thread of a routine is using its lease or asks for a new one.
     fn uses_lease(&self, program: &Program, routine: u64) -> bool {
         let uses = |current: &Current| match current.phase {
-            // Whoever waits holds nothing, and may wait for what the others do.
+            // A state that waits uses no resources, and may wait for what the others do.
             Phase::Running => !program.state(current.state).is_pause(),
             phase => matches!(phase, Phase::Acquiring | Phase::Projecting),
         };
@@ -205,7 +205,7 @@ impl Interpreter {
         self.threads_of(routine).filter(|thread| matches!(self.phase(*thread), Some(Phase::Queued(_))))
     }
 
-    /// What the threads of a routine are at.
+    /// The current actions of a routine's threads.
     fn currents_of(&self, routine: u64) -> impl Iterator<Item = &Current> {
         self.threads
             .values()
@@ -219,7 +219,7 @@ impl Interpreter {
 }
 
 impl Current {
-    /// What it holds, to be given back.
+    /// Takes its lease and projection, to be given back.
     pub(super) fn take_held(&mut self) -> Current {
         let (lease, projection) = (self.lease.take(), self.projection.take());
         Current { lease, projection, path: String::new(), units: Vec::new(), ..*self }

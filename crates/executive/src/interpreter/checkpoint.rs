@@ -1,5 +1,5 @@
-//! The interpreter's part of a checkpoint: its threads with the variables that they share, and its projection as what it has
-//! otherwise than the root.
+//! The interpreter's part of a checkpoint: its threads with their shared variables, and its projection as the difference
+//! from the root.
 
 use super::{Interpreter, Target, Thread};
 use crate::checkpoint::{Pool, at};
@@ -12,10 +12,10 @@ use std::cmp::Ordering;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Values, and the threads with the names of their variables and the places of the values.
+/// The shared values, and per thread the names of its variables with the places of their values.
 type Form<V, T, N> = (Vec<V>, Vec<(u64, T, Vec<(N, u32)>)>);
 
-/// A join tells what a region has assigned by whether it still shares the value: so sharing is state.
+/// Keeps which threads share a value: a join recognizes an assignment by a value that is not shared.
 pub(super) fn serialize<S: Serializer>(threads: &BTreeMap<u64, Thread>, to: S) -> Result<S::Ok, S::Error> {
     let mut values: Pool<&Value> = Pool::default();
     let mut forms = Vec::new();
@@ -48,7 +48,7 @@ pub(super) fn deserialize<'d, D: Deserializer<'d>>(from: D) -> Result<BTreeMap<u
 }
 
 impl Interpreter {
-    /// The world of its projection, if it works on one.
+    /// The world of its projection, if it works on a projection.
     pub(crate) fn projection(&self) -> Option<&World> {
         match &self.target {
             Target::Actual => None,
@@ -56,7 +56,6 @@ impl Interpreter {
         }
     }
 
-    /// Its projection is this.
     pub(crate) fn set_projection(&mut self, projection: World) {
         if let Target::Projection { world, .. } = &mut self.target {
             *world = projection;
@@ -64,7 +63,6 @@ impl Interpreter {
     }
 }
 
-/// What makes the root a world.
 pub(crate) fn difference(root: &World, world: &World) -> Vec<Change> {
     let mut changes = Vec::new();
     let (mut root, mut world) = (root.iter().peekable(), world.iter().peekable());
@@ -87,7 +85,7 @@ pub(crate) fn difference(root: &World, world: &World) -> Vec<Change> {
     }
 }
 
-/// What is no number is not equal to itself: then it is written once more.
+/// NaN is not equal to itself; such a fact is written once more.
 fn is_same(a: &Fact, b: &Fact) -> bool {
     std::ptr::eq(a, b) || a.value == b.value
 }

@@ -10,14 +10,14 @@ use ratn_model::program::{ABORTED, Program, SUCCESS, State, is_failure};
 use ratn_model::value::Value;
 use std::sync::Arc;
 
-/// How many variables there were before a state was entered, where `variables` are those of its frame: the scoped ones of a loop are there in
-/// every iteration, and its frame counts them.
+/// Number of variables before a state was entered, given `variables` of its frame. The frame of a loop also counts the loop's own scoped
+/// variables, because they exist in every iteration.
 pub(super) fn outside(state: &State, variables: usize) -> usize {
     if state.is_loop() { variables.saturating_sub(state.variables.len()) } else { variables }
 }
 
 impl Interpreter {
-    /// A composite state is left. What fails on the way makes it `aborted`.
+    /// Leaves a composite state. An error on the way makes its outcome `aborted`.
     #[expect(clippy::too_many_arguments, reason = "all of it is one activation")]
     pub(super) fn exit(
         &mut self,
@@ -31,7 +31,7 @@ impl Interpreter {
     ) {
         let state = context.program.state(id);
         let result = self.boundary(context, thread, state, path, variables, &outcome);
-        // The task's own variables are seen by its outputs.
+        // The task's outputs may use the task's own variables.
         if id != Program::ROOT
             && let Some(thread) = self.threads.get_mut(&thread)
         {
@@ -47,7 +47,7 @@ impl Interpreter {
         self.ended(thread, id, outcome, reason);
     }
 
-    /// What it does; the new values of variables.
+    /// Everything that the exit does; returns the new values of variables.
     fn boundary(
         &mut self,
         context: &mut Context<'_>,
@@ -57,7 +57,7 @@ impl Interpreter {
         variables: usize,
         outcome: &str,
     ) -> Result<Vec<(String, Value)>, String> {
-        // Its loop variables are gone, its scoped ones are still seen.
+        // Loop variables end here; the loop's scoped variables are still visible.
         if state.is_loop()
             && let Some(thread) = self.threads.get_mut(&thread)
         {
@@ -71,7 +71,7 @@ impl Interpreter {
                     Ok(value) => {
                         written.insert(output.name.clone(), value);
                     }
-                    // Left by an outcome of its own, before it was written.
+                    // The state was left by an outcome of its own before this port was written.
                     Err(error) if outcome != SUCCESS && error.is_not_yet_known() => {}
                     Err(error) => return Err(format!("output `{}`: {error}", output.name)),
                 }
@@ -88,7 +88,8 @@ impl Interpreter {
         Ok(assigned)
     }
 
-    /// The effects that a state declares for an outcome happen: those of an action are its instance's, those of a composite state nobody's.
+    /// Applies the effects that a state declares for an outcome. They belong to the action's instance, or to instance 0 for a composite
+    /// state.
     pub(super) fn change(
         &mut self,
         context: &mut Context<'_>,
@@ -105,7 +106,7 @@ impl Interpreter {
         self.apply(context, instance, path, changes.into())
     }
 
-    /// The values that a state assigns to variables.
+    /// The values that a state assigns to variables, evaluated.
     pub(super) fn assigned(
         &self,
         context: &Context<'_>,
@@ -120,7 +121,7 @@ impl Interpreter {
         state.assign.iter().map(value).collect()
     }
 
-    /// Variables get new values, each the innermost of its name.
+    /// Assigns new values, each to the innermost variable of its name.
     pub(super) fn assign(&mut self, thread: u64, assigned: Vec<(String, Value)>) {
         let Some(thread) = self.threads.get_mut(&thread) else { return };
         for (name, value) in assigned {
@@ -144,7 +145,7 @@ impl Interpreter {
                 context.allows(world, &made)?;
                 world.apply(&made.changes).map_err(|e| e.to_string())?;
                 writers.extend(std::iter::repeat_n(Arc::from(path), made.changes.len()));
-                // What is written again was measured anew, or not at all.
+                // The evidence of a fact that is written again is replaced or dropped.
                 let again = |fact: &FactKey| made.changes.iter().any(|change| change.pattern().matches(fact));
                 evidence.retain(|(fact, _)| !again(fact));
                 evidence.extend(made.evidence);

@@ -5,10 +5,9 @@
 //! lease, on the actual world or, for a routine that only computes, on a projection). It shares no code with the window's
 //! scheduling: the two check each other.
 //!
-//! A thread of control has a stack of frames (the lists it is in) and does one thing at a time: [`walk`] says what is next,
-//! [`node`] lives the life of one action, [`again`] tries it anew, [`exit`] does what composite states do at their ends,
-//! [`waits`] lives that of one that waits,
-//! [`routine`] holds what a routine needs from its entry to its end, [`turns`] lets its threads share that, [`regions`] forks and joins, [`stop`] ends what is under way.
+//! A thread of control has a stack of frames (the lists it is in) and does one thing at a time: [`walk`] chooses the next state, [`node`] executes one action,
+//! [`again`] retries it, [`exit`] leaves composite states, [`waits`] executes states that wait, [`routine`] holds what a routine needs from its entry to its
+//! end, [`turns`] shares this among the routine's threads, [`regions`] forks and joins, [`stop`] cancels what is under way.
 
 mod again;
 mod checkpoint;
@@ -45,7 +44,7 @@ pub(crate) use checkpoint::difference;
 pub(crate) use routine::Routine;
 use serde::{Deserialize, Serialize};
 
-/// How often a computing or sensing node is tried when its worker dies, unless the state says otherwise.
+/// Number of attempts of a computing or sensing node whose worker dies, unless the state declares another.
 pub(crate) const DEFAULT_ATTEMPTS: u32 = 3;
 
 /// Where effects go.
@@ -55,23 +54,23 @@ pub(crate) enum Target {
     Actual,
     /// Into a projection: nothing becomes real.
     Projection {
-        /// The root's revision below it.
+        /// The root's revision below the projection.
         base: Revision,
-        /// What was changed since, in order: first what older instances will have changed, then what this one has.
+        /// Changes since then, in order: first the effects of older instances, then those of this routine.
         changes: Vec<Change>,
-        /// The path of who makes each.
+        /// The path of the writer of each change.
         writers: Vec<Arc<str>>,
-        /// How many of them are the older instances'.
+        /// Number of the changes by older instances.
         before: usize,
-        /// What measured which of this one's.
+        /// Evidence for the changes by this routine.
         evidence: Evidence,
-        /// The result.
+        /// The projected world.
         #[serde(skip)]
         world: World,
     },
 }
 
-/// Whether the interpreter is still at it.
+/// Whether the interpreter goes on.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Progress {
     /// It waits for events.
@@ -80,7 +79,7 @@ pub(crate) enum Progress {
     Ended {
         /// The outcome of the state it executes.
         outcome: String,
-        /// Why, when that is not success.
+        /// Reason, if the outcome is not success.
         reason: String,
     },
 }
@@ -90,24 +89,24 @@ pub(crate) enum Progress {
 struct Frame {
     /// The state whose list it is.
     owner: StateId,
-    /// Which of its lists.
+    /// Its number among the owner's lists.
     list: usize,
     /// The owner's path, without the iteration.
     path: String,
     /// How often each state of the list was visited.
     visits: BTreeMap<StateId, u32>,
-    /// Of a loop: the number of the iteration, and its elements; none of a `while`.
+    /// In a loop: the number of the iteration, and the elements (`None` in a `while`).
     iteration: Option<(usize, Option<List>)>,
     /// How many variables there were before the owner was entered.
     variables: usize,
-    /// Why the last state of it that failed did so.
+    /// Reason of the last failure in this list.
     because: String,
 }
 
 /// What a thread does next.
 #[derive(Serialize, Deserialize)]
 enum Todo {
-    /// Visit a state, under this path if it is the first.
+    /// Visit a state; the path is given for the first state only.
     Enter(StateId, Option<String>),
     /// A state has ended.
     Ended { state: StateId, outcome: String, reason: String },
@@ -115,66 +114,65 @@ enum Todo {
     Iterate,
     /// An action is under way.
     Busy,
-    /// Its regions are under way; once it is decided, those that are cut short.
+    /// Regions are under way. Once `decided` is set, only those that are cut short still are.
     Join { state: StateId, path: String, regions: Vec<u64>, decided: Option<Decided> },
-    /// It has come to its end.
+    /// The thread has ended.
     Done { outcome: String, reason: String },
 }
 
-/// How a concurrency will end, once what it cuts short has ended.
+/// The decision of a concurrency whose other regions are still being cut short.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 struct Decided {
-    /// The first region that had ended.
+    /// The first region, in program order, that has ended.
     first: Option<usize>,
-    /// Of so many successes: whether they are there, or can no longer be.
+    /// With `successes`: whether enough regions succeeded (true), or no longer can (false).
     enough: Option<bool>,
-    /// The last region had begun.
+    /// Whether the last region had begun.
     is_entered: bool,
 }
 
-/// A thread that is cut short: what it had under way is cancelled, and it leaves one state after the other.
+/// State of a thread that is cut short: its goal is cancelled, and it leaves one state after the other.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 struct CutShort {
-    /// So many frames there are while a `finally` is done; none before the first.
+    /// Number of frames while a `finally` is executed; 0 before the first one.
     frames: usize,
-    /// What could not be done on the way out.
+    /// First error on the way out.
     problem: String,
 }
 
-/// A thread of control: the state's, or a region's.
+/// A thread of control: the main one, or that of a region.
 #[derive(Serialize, Deserialize)]
 struct Thread {
     frames: Vec<Frame>,
-    /// The innermost last. Regions share the values: a long list is not copied at every fork.
+    /// The innermost variable last. Regions share the values, so a long list is not copied at every fork.
     #[serde(skip)]
     variables: Vec<(String, Arc<Value>)>,
     todo: Todo,
     current: Option<Current>,
-    /// The routine that it is in.
+    /// The routine around the thread.
     routine: Option<u64>,
-    /// Its visits since it last started something; see [`crate::context::MAX_IDLE_VISITS`].
+    /// Visits since it last started an action; see [`crate::context::MAX_IDLE_VISITS`].
     idle_visits: u32,
-    /// Another region was first.
+    /// Set when another region has won the race.
     cut_short: Option<CutShort>,
 }
 
-/// How far an action is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 enum Phase {
-    /// The operator lets nothing begin; it may have its resources already.
+    /// The operator lets no PIA begin; it may already have its resources.
     Held,
-    /// Its worker died: it waits until its routine has got all of its resources anew.
+    /// Its worker died: it waits until its routine has a new lease.
     Stalled,
-    /// It waits before its next try.
+    /// It waits until the next try.
     Backoff(Timestamp),
     Acquiring,
     Projecting,
     Running,
-    /// Another thread of its routine works with what it needs; lower numbers first.
+    /// Another thread of its routine uses the units that it needs; the lowest number is next.
     Queued(u64),
 }
 
-/// An action under way, or a routine that waits for what it needs.
+/// The current action of a thread, or a routine that waits for its resources.
 #[derive(Serialize, Deserialize)]
 struct Current {
     instance: InstanceId,
@@ -183,11 +181,11 @@ struct Current {
     attempt: u32,
     tries: u32,
     crashes: u32,
-    /// In a pause before its next try: its worker died, and the lease of its routine is still that one's.
+    /// Its worker died: it is in backoff, and the routine's lease still contains that worker.
     #[serde(default)]
     has_died: bool,
     phase: Phase,
-    /// When its goal has had its time.
+    /// When the goal reaches its timeout.
     timeout: Option<Timestamp>,
     #[serde(with = "leases")]
     lease: Option<Lease>,
@@ -203,23 +201,23 @@ pub(crate) struct Interpreter {
     threads: BTreeMap<u64, Thread>,
     last_thread: u64,
     outputs: BTreeMap<StateId, Outputs>,
-    /// The states of loops whose outputs are those of the iteration before.
+    /// States of loop bodies whose outputs are still those of the iteration before.
     earlier: BTreeSet<StateId>,
-    /// How regions ended.
+    /// Outcomes of regions.
     regions: BTreeMap<StateId, String>,
     routines: BTreeMap<u64, Routine>,
     last_routine: u64,
     last_turn: u64,
     target: Target,
     hold: Hold,
-    /// Whether the world has changed since what it may end was looked at.
+    /// Whether the world has changed since waits and watched motions were last checked.
     #[serde(skip, default)]
     has_changed: bool,
-    /// Why everything ends: a thread goes in circles.
+    /// Why the run ends, if a thread goes in circles.
     in_circles: Option<String>,
 }
 
-/// The thread of the state itself, and the routine of the window that it executes.
+/// Number of the main thread, and of the window's routine that it executes.
 const MAIN: u64 = 0;
 
 impl Interpreter {
@@ -272,12 +270,12 @@ impl Interpreter {
         }
     }
 
-    /// What the window's routine holds now.
+    /// The present lease of the window's routine.
     pub(crate) fn lease(&self) -> Option<&Lease> {
         self.routines.get(&MAIN)?.lease.as_ref()
     }
 
-    /// Whether the window's routine asks for all that it needs anew.
+    /// Whether the window's routine is asking for a new lease.
     pub(crate) fn asks(&self) -> bool {
         self.threads.values().flat_map(|thread| &thread.current).any(|current| current.phase == Phase::Acquiring)
     }
@@ -290,17 +288,16 @@ impl Interpreter {
         self.go_on_with(context)
     }
 
-    /// Whether an instance is one of those under way.
+    /// Whether this instance is under way here.
     pub(crate) fn is_at(&self, instance: InstanceId) -> bool {
         self.threads.values().flat_map(|thread| &thread.current).any(|current| current.instance == instance)
     }
 
-    /// Whether it has ended because a thread went on and on without an action.
+    /// Whether it has ended because a thread went in circles (too many visits without an action).
     pub(crate) fn is_in_circles(&self) -> bool {
         self.in_circles.is_some()
     }
 
-    /// What the states it executed have written.
     pub(crate) fn outputs(&self) -> &BTreeMap<StateId, Outputs> {
         &self.outputs
     }
@@ -311,7 +308,7 @@ impl Interpreter {
         main.variables.iter().rev().find(|(n, _)| n == name).map(|(_, value)| &**value)
     }
 
-    /// The changes it has made to its projection; none in the actual world, where they are real already.
+    /// The changes that it has made to its projection; none on the actual world, where they are already real.
     pub(crate) fn into_made(self) -> Made {
         match self.target {
             Target::Actual => Made::default(),
@@ -321,7 +318,7 @@ impl Interpreter {
         }
     }
 
-    /// Uses the scope of the outermost state: its parameters, and the outputs of what it has executed.
+    /// Calls `use_scope` with the scope of the outermost state: its parameters, and the outputs of the executed states.
     pub(crate) fn in_scope<T>(
         &self,
         context: &Context<'_>,
@@ -330,9 +327,9 @@ impl Interpreter {
         self.with_scope(context, MAIN, None, use_scope)
     }
 
-    /// An event for an instance under way, for all of them, or for the operator's wishes; others are not for us.
+    /// Handles an event for an instance under way, for all of them, or from the operator; ignores the others.
     pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Progress {
-        // An operator was told that his answer has come: the time that is up at this very moment does not throw it away.
+        // The operator was told that the answer has arrived: a timeout at this very moment does not discard it.
         if let Event::Answered { instance, choice } = &event {
             self.answered(context, *instance, choice);
         }
@@ -403,12 +400,11 @@ impl Interpreter {
         progress
     }
 
-    /// These are the breakpoints from now on.
     pub(crate) fn break_at(&mut self, program: &Program, breakpoints: Vec<String>) {
         self.hold.break_at(program, breakpoints);
     }
 
-    /// As [`crate::executive::Executive::breakpoints`].
+    /// The breakpoints; see [`crate::executive::Executive::breakpoints`].
     pub(crate) fn breakpoints(&self) -> &[String] {
         self.hold.breakpoints()
     }
@@ -421,7 +417,7 @@ impl Interpreter {
         self.threads.get(&thread)?.current.as_ref().map(|current| current.phase)
     }
 
-    /// Uses the scope of a thread where it stands.
+    /// Calls `use_scope` with the present scope of a thread.
     fn with_scope<T>(
         &self,
         context: &Context<'_>,

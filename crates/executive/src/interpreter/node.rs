@@ -1,4 +1,4 @@
-//! One action: acquire, project, run, and what its end changes. A routine begins as an action does.
+//! One action: acquire, project, run, and the effects at its end. A routine begins as an action does.
 
 use super::{Current, Interpreter, Phase, Target};
 use crate::binding::{self, Outputs};
@@ -15,7 +15,7 @@ use ratn_model::program::{ABORTED, PREEMPTED, STOPPED, SUCCESS, StateKind, WORLD
 use ratn_model::resource::Lease;
 use ratn_model::value::Value;
 
-/// How a goal has ended, as its provider says.
+/// The end of a goal, as its provider reports it.
 pub(super) struct GoalEnd {
     pub(super) outcome: String,
     pub(super) outputs: Outputs,
@@ -48,9 +48,9 @@ impl Interpreter {
         self.try_now(context, thread);
     }
 
-    /// Begins a try, unless a precondition does not hold or the operator lets nothing begin.
+    /// Begins a try, unless a precondition does not hold or the operator lets no PIA begin.
     pub(super) fn try_now(&mut self, context: &mut Context<'_>, thread: u64) {
-        // What it requires is looked at when it may begin.
+        // Preconditions are checked when it may begin.
         if self.is_held(context, thread) {
             return self.set_phase(thread, Phase::Held);
         }
@@ -76,8 +76,8 @@ impl Interpreter {
         }
     }
 
-    /// Whether the preconditions hold in the world as it is; else the node ends `aborted`. They are looked at before every try: the
-    /// world may have been changed since the last one.
+    /// Checks the preconditions in the actual world; if one does not hold, the node ends `aborted`. They are checked before every try, because the
+    /// world may have changed since the last one.
     pub(super) fn may_try(&mut self, context: &mut Context<'_>, thread: u64) -> bool {
         let Some(current) = self.current(thread) else { return false };
         let state = context.program.state(current.state);
@@ -90,7 +90,7 @@ impl Interpreter {
         false
     }
 
-    /// The operator lets something begin.
+    /// The operator lets PIAs begin: held ones go on.
     pub(super) fn let_go(&mut self, context: &mut Context<'_>) {
         let held: Vec<u64> =
             self.threads.keys().copied().filter(|thread| self.phase(*thread) == Some(Phase::Held)).collect();
@@ -104,8 +104,8 @@ impl Interpreter {
         }
     }
 
-    /// The pause began while it waited for its resources. It gives them back, for others may want them meanwhile, and asks anew when it may begin;
-    /// what it has used up by that it keeps. What it was shown of the world may be otherwise then.
+    /// Holds a node that was waiting for its resources. It gives them back, because others may want them, and asks again when it may begin; a
+    /// lease with consumed resources is kept. A new projection is made then, because the world may change.
     pub(super) fn hold_back(&mut self, context: &mut Context<'_>, thread: u64) {
         let Some(current) = self.current(thread) else { return };
         current.phase = Phase::Held;
@@ -116,8 +116,8 @@ impl Interpreter {
         self.give_back(context, &given);
     }
 
-    /// Whether the operator lets a node not begin; where it stands at a breakpoint, nothing else begins from now on. A routine is one PIA: what it
-    /// contains is not held.
+    /// Whether the operator does not let a node begin. If it stands at a breakpoint, the run pauses from now on. A routine is one PIA: its parts
+    /// are not held.
     pub(super) fn is_held(&mut self, context: &mut Context<'_>, thread: u64) -> bool {
         if self.routine_of(thread).is_some() || !self.is_pia(context, thread) {
             return false;
@@ -152,13 +152,13 @@ impl Interpreter {
         if self.is_held(context, thread) {
             return self.hold_back(context, thread);
         }
-        // While it waited for them, somebody else may have changed what it requires.
+        // While it waited for its resources, its preconditions may have become false.
         if self.may_try(context, thread) {
             self.go_on(context, thread);
         }
     }
 
-    /// It has its resources.
+    /// The node has its resources: it goes on.
     fn go_on(&mut self, context: &mut Context<'_>, thread: u64) {
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         if context.program.state(current.state).is_routine() {
@@ -231,7 +231,7 @@ impl Interpreter {
             projection: current.projection,
             expected_s: self.with_scope(context, thread, None, |scope| binding::expected_s(state, scope)),
             timeout_s: state.annotations.timeout_s,
-            // Nothing waits meanwhile, so it would be for nothing.
+            // Nothing else runs meanwhile, so an improvement would be useless.
             improves: None,
             reads_nothing: context.plan.state(current.state).reads_nothing(),
         };
@@ -249,12 +249,12 @@ impl Interpreter {
         context.commands.push(Command::Start { instance, attempt, goal: Box::new(goal) });
     }
 
-    /// It ends `aborted` without an answer: nothing more is said of the world.
+    /// Ends a node `aborted` without a result; it changes nothing in the world.
     pub(super) fn end_node(&mut self, context: &mut Context<'_>, thread: u64, reason: String) {
         self.end_unanswered(context, thread, ABORTED, reason);
     }
 
-    /// It ends so, and nothing is said of the world: not even what the outcome declares.
+    /// Ends a node without a result; not even the declared effects of the outcome are applied.
     pub(super) fn end_unanswered(&mut self, context: &mut Context<'_>, thread: u64, outcome: &str, reason: String) {
         let Some(current) = self.threads.get_mut(&thread).and_then(|thread| thread.current.take()) else { return };
         context.note(Note::Finished { instance: current.instance, outcome: outcome.into() });
@@ -300,7 +300,7 @@ impl Interpreter {
         }
         context.note(Note::Finished { instance, outcome: outcome.as_str().into() });
         let nature = context.plan.state(id).nature;
-        // What a wait foresees is somebody else's doing.
+        // The effects that a wait foresees are made by somebody else.
         let declared = if state.is_pause() { Some(&[][..]) } else { effects::declared(state, nature, &outcome) };
         let changes =
             self.with_scope(context, thread, Some(&outputs), |s| effects::actual(declared, &outcome, &measured, s));
@@ -321,14 +321,14 @@ impl Interpreter {
         self.leaves(context, instance);
         let reason = match reason.as_str() {
             _ if outcome == SUCCESS => String::new(),
-            // Its worker gave none.
+            // The provider gave no reason.
             "" => current.path,
             reason => format!("{}: {reason}", current.path),
         };
         self.ended(thread, id, outcome, reason);
     }
 
-    /// Nothing more comes of it.
+    /// Notes that the instance is over.
     fn leaves(&self, context: &mut Context<'_>, instance: InstanceId) {
         context.note(match self.target {
             Target::Actual => Note::Retired { instance },

@@ -1,4 +1,4 @@
-//! Concurrency: a thread per region, and the decider when they have ended.
+//! Concurrency: one thread per region, and the decider when they have ended.
 
 use super::{Decided, Interpreter, Thread, Todo};
 use crate::context::Context;
@@ -8,7 +8,7 @@ use ratn_model::wait::Wait;
 use std::sync::Arc;
 
 impl Interpreter {
-    /// Every region begins, each with its own copy of the variables.
+    /// Begins every region, each with its own copy of the variables.
     pub(super) fn fork(&mut self, thread: u64, state: StateId, path: String, regions: &[StateId]) {
         let Some(around) = self.threads.get(&thread) else { return };
         let (variables, routine) = (around.variables.clone(), around.routine);
@@ -33,7 +33,7 @@ impl Interpreter {
         self.set(thread, Todo::Join { state, path, regions: threads, decided: None });
     }
 
-    /// Whether enough regions have ended.
+    /// Whether enough regions have ended for the join.
     pub(super) fn may_join(
         &self,
         program: &Program,
@@ -57,17 +57,15 @@ impl Interpreter {
         }
     }
 
-    /// Whether all of them have.
     pub(super) fn have_ended(&self, regions: &[u64]) -> bool {
         regions.iter().all(|region| self.region_end(*region).is_some())
     }
 
-    /// How many regions have ended with success.
     fn succeeded(&self, regions: &[u64]) -> usize {
         regions.iter().filter(|region| self.region_end(**region).is_some_and(|(outcome, _)| outcome == SUCCESS)).count()
     }
 
-    /// How a region has ended, and why.
+    /// Outcome and reason of a region that has ended.
     pub(super) fn region_end(&self, region: u64) -> Option<(&str, &str)> {
         match &self.threads.get(&region)?.todo {
             Todo::Done { outcome, reason } => Some((outcome, reason)),
@@ -75,7 +73,7 @@ impl Interpreter {
         }
     }
 
-    /// Enough regions have ended: the others are cut short, and when these have ended, too, the outcomes decide.
+    /// Enough regions have ended: cuts the others short; when these have ended, too, the outcomes decide.
     pub(super) fn join(
         &mut self,
         context: &mut Context<'_>,
@@ -147,7 +145,7 @@ impl Interpreter {
         }
         self.decided(context, &path, outcome.clone());
         if outcome == VIOLATED && watches && !is_entered {
-            // What is watched has not begun: it has changed nothing.
+            // The watched state has not begun, so it has changed nothing.
             if let Some(thread) = self.threads.get_mut(&thread) {
                 thread.variables.truncate(base);
             }
@@ -156,7 +154,7 @@ impl Interpreter {
         self.exit(context, thread, id, &path, base, outcome, reason);
     }
 
-    /// How a concurrency will end.
+    /// The present decision of a concurrency.
     fn decision(&self, program: &Program, id: StateId, regions: &[u64]) -> Decided {
         let StateKind::Concurrency { successes, .. } = &program.state(id).kind else {
             return Decided { first: None, enough: None, is_entered: true };
@@ -169,7 +167,8 @@ impl Interpreter {
         }
     }
 
-    /// What regions assigned to variables outside is seen from here on; where several did, the last region's.
+    /// Takes over what regions assigned to variables outside; if several assigned the same variable, the last region
+    /// wins.
     pub(super) fn merge_variables(&mut self, thread: u64, regions: &[u64]) {
         let Some(before) = self.threads.get(&thread).map(|thread| thread.variables.clone()) else { return };
         for region in regions {

@@ -1,7 +1,7 @@
-//! A routine of HSM mode: it asks for all that it contains at its entry, as one PIA if any of it is one, and holds it to its end,
-//! so that no other node gets them in between. Routines and preemptive concurrencies inside of it are part of it.
+//! Routines in HSM mode. A routine acquires at its entry everything that its parts need and holds it to its end, so that no other
+//! node gets it in between. It is one PIA if any part is one. Inner routines and preemptive concurrencies belong to it.
 //!
-//! A routine of the window has its lease from there; it is the one that everything in its interpreter is in.
+//! A routine of the window gets its lease from the window; everything in its interpreter belongs to that routine.
 
 use super::{Interpreter, Target};
 use crate::binding;
@@ -12,16 +12,16 @@ use ratn_model::id::{InstanceId, StateId};
 use ratn_model::resource::{Lease, Requirement};
 use serde::{Deserialize, Serialize};
 
-/// What a routine holds for everything it contains.
+/// The resources that a routine holds for all its parts.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Routine {
-    /// What it asks for.
+    /// The resources that it acquires.
     #[serde(with = "requirements")]
     pub(crate) requirements: Vec<Requirement>,
-    /// What it was granted; `None` while it asks again because a worker of it died.
+    /// Its lease; `None` while it acquires a new one because a worker died.
     #[serde(with = "leases")]
     pub(crate) lease: Option<Lease>,
-    /// The thread that entered it, and its visit; `None` of a routine of the window.
+    /// The thread that entered it, its state and its instance; `None` for a routine of the window.
     pub(crate) visit: Option<(u64, StateId, InstanceId)>,
 }
 
@@ -34,7 +34,6 @@ impl Interpreter {
         self.routines.get_mut(&self.threads.get(&thread)?.routine?)
     }
 
-    /// It has got its resources, and what it contains begins.
     pub(super) fn begin_routine(&mut self, context: &mut Context<'_>, thread: u64) {
         if self.is_held(context, thread) {
             return self.hold_back(context, thread);
@@ -62,7 +61,7 @@ impl Interpreter {
         self.enter_composite(context, thread, id, path);
     }
 
-    /// A state has ended; if it is a routine, it gives back what it held.
+    /// A state has ended; if it is a routine, it releases its lease.
     pub(super) fn end_routine(&mut self, context: &mut Context<'_>, thread: u64, state: StateId, outcome: &str) {
         let Some(of) = self.threads.get_mut(&thread) else { return };
         let Some(number) = of.routine else { return };
@@ -78,7 +77,7 @@ impl Interpreter {
         context.note(Note::Retired { instance });
     }
 
-    /// The run ends: every routine under way gives back what it holds.
+    /// The run ends: every routine under way releases its lease.
     pub(super) fn give_up_routines(&mut self, context: &mut Context<'_>) {
         let entered = self.routines.iter().filter_map(|(number, routine)| Some((*number, routine.visit?.2)));
         for (number, instance) in entered.collect::<Vec<_>>() {

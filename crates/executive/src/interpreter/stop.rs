@@ -1,7 +1,7 @@
-//! Ending what is under way: all of it when the run ends, a region when another one was first.
+//! Cancelling what is under way: everything when the run ends, or a region when another region has won.
 //!
-//! A region that is cut short leaves the states in which it is, the innermost first. A state with something to do on every way out is left
-//! when that is done: the region goes on with it, and ends when it has left the last of them. Only then the concurrency around it has ended.
+//! A region that is cut short leaves its states, the innermost first. A state with a `finally` is left when its `finally` has been executed. The
+//! region ends when it has left the last of them; the concurrency around it ends only then.
 
 use super::{CutShort, Frame, Interpreter, MAIN, Phase, Target, Thread, Todo};
 use crate::binding::Outputs;
@@ -15,11 +15,11 @@ use ratn_model::value::Value;
 use std::collections::BTreeMap;
 
 impl Interpreter {
-    /// Ends everything under way. What a motion says of being cut short is true; what composite states do at their ends is left undone.
+    /// Cancels everything under way. Effects that a motion declares for `preempted` are applied; the exits of composite states are not executed.
     pub(crate) fn abort(&mut self, context: &mut Context<'_>) {
         let all: Vec<u64> = self.threads.keys().copied().collect();
         for thread in all {
-            // The run ends anyway.
+            // Errors do not matter: the run ends anyway.
             let _ = self.cancel(context, thread);
             self.set(thread, Todo::Done { outcome: PREEMPTED.to_owned(), reason: String::new() });
         }
@@ -30,7 +30,7 @@ impl Interpreter {
         self.threads.get(&thread).is_some_and(|thread| thread.cut_short.is_some())
     }
 
-    /// Whether a thread is cut short and leaves states, and does nothing on the way out of one.
+    /// Whether a thread is cut short and executes no `finally` at present.
     pub(super) fn is_leaving(&self, thread: u64) -> bool {
         let is_leaving = |thread: &Thread| {
             thread.cut_short.as_ref().is_some_and(|cut| cut.frames == 0 || thread.frames.len() < cut.frames)
@@ -38,8 +38,8 @@ impl Interpreter {
         self.threads.get(&thread).is_some_and(is_leaving)
     }
 
-    /// Another region was first: what this one has under way is cancelled and ends `preempted`, then the composite states in which it is, the
-    /// innermost first. Nothing happens where it has ended, or is on its way out.
+    /// Cuts a region short because another one has won: cancels its action, which ends `preempted`, then leaves the composite states that it is
+    /// in, the innermost first. Does nothing if the region has ended or is already on its way out.
     pub(super) fn cut_short(&mut self, context: &mut Context<'_>, id: u64) {
         if self.is_cut_short(id) || self.region_end(id).is_some() {
             return;
@@ -48,7 +48,7 @@ impl Interpreter {
         let Some(thread) = self.threads.get_mut(&id) else { return };
         thread.cut_short = Some(CutShort::default());
         let todo = std::mem::replace(&mut thread.todo, Todo::Busy);
-        // What was to be done on the way out has been done.
+        // The `finally` of this state has been executed already.
         if let Todo::Ended { state, .. } = &todo
             && let Some(frame) = thread.frames.last()
             && finally(context.program, frame).is_some_and(|finally| finally.lastly.values().any(|last| last == state))
@@ -72,7 +72,7 @@ impl Interpreter {
         }
     }
 
-    /// The regions of a concurrency that is cut short have ended.
+    /// Leaves a concurrency whose regions have been cut short.
     pub(super) fn leave_regions(
         &mut self,
         context: &mut Context<'_>,
@@ -93,7 +93,7 @@ impl Interpreter {
         self.leave_all(context, id);
     }
 
-    /// A region that is cut short leaves the states in which it is, as far as the next one with something to do on the way out.
+    /// A region that is cut short leaves its states, up to the next one with a `finally`.
     fn leave_all(&mut self, context: &mut Context<'_>, id: u64) {
         // The outermost frame is that of the concurrency itself.
         while let Some(thread) = self.threads.get_mut(&id).filter(|thread| thread.frames.len() > 1)
@@ -117,8 +117,8 @@ impl Interpreter {
         self.set(id, Todo::Done { outcome: outcome.to_owned(), reason });
     }
 
-    /// A state has ended in a thread that is cut short: where what had to be done on the way out of it is done, the thread leaves the states
-    /// around it; whether it does.
+    /// A state has ended in a thread that is cut short. If that completes a `finally`, the thread leaves the states around it and the result is
+    /// true.
     pub(super) fn goes_on_out(
         &mut self,
         context: &mut Context<'_>,
@@ -140,7 +140,7 @@ impl Interpreter {
         true
     }
 
-    /// The first problem on the way out is told.
+    /// Keeps the first error on the way out.
     fn has_problem(&mut self, id: u64, result: Result<(), String>) {
         if let Err(problem) = result
             && let Some(cut) = self.threads.get_mut(&id).and_then(|thread| thread.cut_short.as_mut())
@@ -162,12 +162,12 @@ impl Interpreter {
         changed.map_err(|problem| format!("{path}: {problem}"))
     }
 
-    /// What composite states say of being cut short is true, of one that a run is in which has been told to end.
+    /// Applies the `preempted` effects of a composite state, for a run that was told to end inside of it.
     pub(crate) fn leave(&mut self, context: &mut Context<'_>, state: StateId, path: &str) -> Result<(), String> {
         self.leave_preempted(context, MAIN, (InstanceId(0), state), path)
     }
 
-    /// What is still to be done where everything that is under way in the actual world is cut short.
+    /// Adds the `finally` blocks that remain when everything under way in the actual world is cut short.
     pub(crate) fn way_out(&self, program: &Program, way: &mut WayOut) {
         if let Some(Within { places, variables, outputs }) = self.way_out_within(program, way) {
             way.add(program, places.into_iter(), || variables, || outputs);
@@ -175,8 +175,8 @@ impl Interpreter {
         way.hold = self.hold.clone();
     }
 
-    /// The same, but for the thread of the state itself: what that is in is returned. Of a routine of the window, what is around it is of the same
-    /// thread of control. `None` where nothing is real.
+    /// The same for the regions' threads; returns the place of the main thread, because the states around a routine of the window belong to the
+    /// same thread of control. `None` on a projection, where nothing is real.
     pub(crate) fn way_out_within(&self, program: &Program, way: &mut WayOut) -> Option<Within> {
         if !matches!(self.target, Target::Actual) {
             return None;
@@ -193,7 +193,7 @@ impl Interpreter {
         self.threads.get(&MAIN).map(within)
     }
 
-    /// Does what is to be done on the way out of a run that has been told to end, in the scope of where it was.
+    /// An interpreter for one `finally` block of a run that was told to end, in the scope of its place.
     pub(crate) fn on_the_way_out(
         variables: Vec<(String, Value)>,
         outputs: BTreeMap<StateId, Outputs>,
@@ -202,14 +202,14 @@ impl Interpreter {
         Interpreter { hold, ..Interpreter::new(variables, outputs, None, Target::Actual) }
     }
 
-    /// The variables and outputs in the scope of the outermost state, and what the operator lets begin.
+    /// The variables and outputs in the scope of the outermost state, and the operator's holds.
     pub(crate) fn into_scope(mut self) -> (Vec<(String, Value)>, BTreeMap<StateId, Outputs>, Hold) {
         let main = self.threads.remove(&MAIN).map(|main| main.variables).unwrap_or_default();
         let variables = main.into_iter().map(|(name, value)| (name, (*value).clone())).collect();
         (variables, self.outputs, self.hold)
     }
 
-    /// Ends the action that a thread has under way. What that did to the world is said as for any end.
+    /// Cancels the action of a thread. If it was running, its `preempted` effects are applied.
     fn cancel(&mut self, context: &mut Context<'_>, id: u64) -> Result<(), String> {
         let Some(current) = self.threads.get_mut(&id).and_then(|thread| thread.current.take()) else { return Ok(()) };
         let has_begun = current.phase == Phase::Running && !context.program.state(current.state).is_pause();
@@ -234,7 +234,7 @@ impl Interpreter {
 /// The states that a thread has entered and not left, the innermost first.
 fn places(program: &Program, thread: &Thread) -> Vec<Place> {
     let is_region = |frame: &Frame| matches!(program.state(frame.owner).kind, StateKind::Concurrency { .. });
-    // The outermost frame of a region is that of the concurrency, which the thread around is in.
+    // The outermost frame of a region belongs to the concurrency, which the thread around it is in.
     let own = usize::from(thread.frames.first().is_some_and(is_region));
     let joins = match &thread.todo {
         Todo::Join { state, path, .. } => Some((*state, path.clone(), 0)),
@@ -248,7 +248,7 @@ fn places(program: &Program, thread: &Thread) -> Vec<Place> {
     joins.into_iter().chain(thread.frames[own..].iter().rev().map(entered)).collect()
 }
 
-/// What is to be done on every way out of the state that a list belongs to.
+/// The `finally` of the state that a list belongs to.
 pub(super) fn finally<'p>(program: &'p Program, frame: &Frame) -> Option<&'p Finally> {
     program.state(frame.owner).annotations.finally.as_ref()
 }

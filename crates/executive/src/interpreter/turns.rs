@@ -1,8 +1,8 @@
-//! Turns within a routine: its lease serves all threads of control in it, and a unit of it performs one goal at a time. Goals that select the
-//! same have so many units as were granted for that; one for which there are too few waits until there are, and who waits first is first. Which
-//! unit of several alike each has is said by the lease that it is given, which lacks those of the others.
+//! Turns within a routine: its lease serves all its threads of control, but each leased unit performs one goal at a time. Goals with the same
+//! selector share the units granted for it. A goal that finds too few free units waits, first come first served. Each goal's lease lacks the units
+//! of the other goals, so that it is clear which of several equal units it uses.
 //!
-//! Outside of a routine every goal has a lease of its own, so that the resource manager sees to the turns.
+//! Outside of a routine every goal has its own lease, and the resource manager decides the turns.
 
 use super::{Current, Interpreter, Phase};
 use crate::context::Context;
@@ -11,7 +11,7 @@ use ratn_model::resource::{Lease, LeasedResource, Requirement, ResourceOperation
 use std::collections::BTreeSet;
 
 impl Interpreter {
-    /// Whether a goal waits for units that another thread of its routine works with.
+    /// Whether a goal has to wait for units that other threads of its routine use.
     pub(super) fn waits_its_turn(&mut self, context: &Context<'_>, thread: u64) -> bool {
         let free = self.free_units(context, thread);
         let waits = free.is_none();
@@ -25,17 +25,17 @@ impl Interpreter {
         waits
     }
 
-    /// Those begin whose turn it is; whether any did.
+    /// Begins the queued goals whose turn it is; true if any began.
     pub(super) fn take_turns(&mut self, context: &mut Context<'_>) -> bool {
         let is_queued = |thread: &u64| matches!(self.phase(*thread), Some(Phase::Queued(_)));
         let queued = self.threads.keys().copied().filter(is_queued);
         let mut has_begun = false;
         for thread in queued.collect::<Vec<_>>() {
-            // While all of it is asked for anew, nothing begins.
+            // Nothing begins while the routine acquires a new lease.
             let waits = self.routine_of(thread).is_some_and(|r| r.lease.is_none() && !r.requirements.is_empty());
             if !waits && self.free_units(context, thread).is_some() {
                 has_begun = true;
-                // What it requires may have been changed while it waited.
+                // Its preconditions may have become false while it waited.
                 if self.may_try(context, thread) {
                     self.project_or_run(context, thread);
                 }
@@ -44,8 +44,8 @@ impl Interpreter {
         has_begun
     }
 
-    /// The units that a goal works with from now on, as far as they can be told apart; `None` where other goals of its routine work with as
-    /// many as there are of what it needs, or wait for that since before.
+    /// The units that a goal may use now, as far as their ids are known; `None` if other goals of its routine use them, or are ahead of it in the
+    /// queue.
     fn free_units(&self, context: &Context<'_>, thread: u64) -> Option<Vec<String>> {
         let none = || Some(Vec::new());
         let Some(own) = self.threads.get(&thread) else { return none() };
@@ -79,14 +79,14 @@ impl Interpreter {
         Some(units)
     }
 
-    /// What the other threads of its routine are at.
+    /// The current actions of the other threads of its routine.
     fn others(&self, thread: u64) -> Vec<&Current> {
         let routine = self.threads.get(&thread).and_then(|thread| thread.routine);
         let others = self.threads.iter().filter(|(id, other)| **id != thread && other.routine == routine);
         others.filter_map(|(_, other)| other.current.as_ref()).collect()
     }
 
-    /// The lease under which a goal is given: in a routine without the units that other goals work with.
+    /// The lease for a goal; inside of a routine without the units that other goals use.
     pub(super) fn lease_of(&self, thread: u64) -> Option<Lease> {
         let current = self.threads.get(&thread)?.current.as_ref()?;
         let Some(routine) = self.routine_of(thread) else { return current.lease.clone() };
@@ -102,36 +102,35 @@ impl Interpreter {
 }
 
 impl Current {
-    /// Whether its goal is under way, or the worker that it had is still to be replaced, also during a pause before its next try.
+    /// Whether its goal is under way, or its dead worker has not been replaced yet (also during backoff).
     fn works(&self) -> bool {
         self.lost_its_worker() || matches!(self.phase, Phase::Projecting | Phase::Running | Phase::Stalled)
     }
 
-    /// Whether it pauses before its next try, and its unit is still the one whose worker died: the routine has not asked for all of it anew since.
+    /// Whether it is in backoff and its unit is still the one whose worker died, because the routine has no new lease since.
     pub(super) fn lost_its_worker(&self) -> bool {
         self.has_died && matches!(self.phase, Phase::Backoff(_))
     }
 }
 
-/// How many units a line wants.
 fn units_of(line: &ResourceExpr) -> usize {
     line.count.units() as usize
 }
 
-/// What a routine has of what a line wants.
+/// How many of the wanted units the routine has.
 struct Granted<'a> {
     count: usize,
-    /// Which, where nothing else of the lease can be meant.
+    /// Their ids, if no other unit of the lease can be meant.
     units: Vec<&'a str>,
 }
 
 impl Granted<'_> {
     fn of<'a>(requirements: &[Requirement], lease: &'a Lease, line: &ResourceExpr) -> Granted<'a> {
-        // What the lease has none of nobody works with.
+        // No goal uses what is not in the lease.
         if !lease.resources.iter().any(|unit| unit.is_a(&line.kind)) {
             return Granted { count: usize::MAX, units: Vec::new() };
         }
-        // Whose attributes or conditions select it is one by itself: which one is not known here.
+        // A line with attributes or conditions has units of its own; their ids are not known here.
         let unknown = || Granted { count: units_of(line), units: Vec::new() };
         if !line.attributes.is_empty() || !line.conditions.is_empty() {
             return unknown();

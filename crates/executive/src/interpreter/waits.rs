@@ -1,5 +1,5 @@
-//! A state that waits: it begins as an action does, and no provider gets a goal. Where the world may have changed or a signal may have
-//! come, every wait under way is looked at.
+//! States that wait: they begin as actions do, but no provider gets a goal. Whenever the world may have changed or a signal may have come,
+//! every wait under way is checked.
 
 use super::node::GoalEnd;
 use super::{Interpreter, Phase, Progress, Thread};
@@ -11,7 +11,7 @@ use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::VIOLATED;
 
 impl Interpreter {
-    /// Goes on until everything waits, and nothing is over that waits.
+    /// Goes on until all threads wait and none of these waits is over.
     pub(super) fn go_on_with(&mut self, context: &mut Context<'_>) -> Progress {
         loop {
             let progress = self.advance(context);
@@ -40,7 +40,7 @@ impl Interpreter {
             current.timeout = until;
         }
         context.note(Note::Running { instance, attempt });
-        // What is over at once is no action: a loop of such waits goes in circles.
+        // A wait that ends at once does not count as an action: a loop of such waits goes in circles.
         if self.ends_waiting(context, thread, id) {
             return;
         }
@@ -54,8 +54,8 @@ impl Interpreter {
         }
     }
 
-    /// Looks at what the world may end (waits, and motions that are watched) until one is over; whether one was. What its end leads to
-    /// comes before the others are looked at.
+    /// Checks waits and watched motions under way until one is over; true if one was. Its consequences are handled before the others are
+    /// checked.
     pub(super) fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
         let waits = |(thread, current): (u64, &super::Current)| {
             let state = context.program.state(current.state);
@@ -73,7 +73,7 @@ impl Interpreter {
         })
     }
 
-    /// Ends a wait if what it waits for is there; whether it did.
+    /// Ends a wait if its condition holds or its signal is kept; true if it ended.
     fn ends_waiting(&mut self, context: &mut Context<'_>, thread: u64, id: StateId) -> bool {
         let state = context.program.state(id);
         if let Some(end) = awaiting::takes(state, context.signals) {
@@ -88,7 +88,8 @@ impl Interpreter {
         true
     }
 
-    /// Ends an action of which a condition does not hold, before it begins (then it has changed nothing) or while it goes on; whether it did.
+    /// Ends an action whose `while` condition does not hold: before it begins (it has changed nothing then) or while it runs. True if it
+    /// ended.
     pub(super) fn ends_violated(&mut self, context: &mut Context<'_>, thread: u64) -> bool {
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return false };
         let state = context.program.state(current.state);
@@ -109,16 +110,16 @@ impl Interpreter {
         true
     }
 
-    /// Its time is up.
+    /// The time of a wait is up.
     pub(super) fn waited_long_enough(&mut self, context: &mut Context<'_>, thread: u64) {
         let Some(id) = self.current(thread).map(|current| current.state) else { return };
-        // What was waited for may have come at this very moment.
+        // Its condition may hold, or its signal may have come, at this very moment.
         if !self.ends_waiting(context, thread, id) {
             self.has_waited(context, thread, awaiting::is_up(context.program.state(id)));
         }
     }
 
-    /// An operator has answered.
+    /// An operator has answered a question.
     pub(super) fn answered(&mut self, context: &mut Context<'_>, instance: InstanceId, choice: &str) {
         let asks = |thread: &Thread| {
             let current = thread.current.as_ref();

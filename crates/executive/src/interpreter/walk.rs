@@ -1,4 +1,4 @@
-//! The walk over the tree of states: which state comes next.
+//! The walk over the tree of states: chooses the next state.
 
 use super::{Frame, Interpreter, MAIN, Progress, Todo};
 use crate::binding::{self, Outputs, child_path};
@@ -11,8 +11,8 @@ use ratn_model::value::Value;
 use std::sync::Arc;
 
 impl Interpreter {
-    /// Lets every thread go on until all wait for events, or the state has ended. What has ended is followed to where something begins; before
-    /// that, what the end has changed may be what another thread waits for, or what must hold for anything to begin.
+    /// Lets every thread go on until all wait for events or the state has ended. Ends are followed first, up to the next state that would begin;
+    /// then waits are checked, because an end may have changed what they wait for; only then do states begin.
     pub(super) fn advance(&mut self, context: &mut Context<'_>) -> Progress {
         loop {
             let follows = |thread: u64, todo: &Todo| match todo {
@@ -51,12 +51,12 @@ impl Interpreter {
         }
     }
 
-    /// The first thread with such a thing to do.
+    /// The first thread whose next step satisfies `is_such`.
     fn first(&self, is_such: impl Fn(u64, &Todo) -> bool) -> Option<u64> {
         self.threads.iter().find(|(id, thread)| is_such(**id, &thread.todo)).map(|(id, _)| *id)
     }
 
-    /// A thread enters a state or begins an iteration; false if it has done so too often without starting anything.
+    /// Counts a visit of a state or an iteration; false if the thread has had too many without an action.
     fn count_visit(&mut self, thread: u64) -> bool {
         let Some(thread) = self.threads.get_mut(&thread) else { return false };
         thread.idle_visits += 1;
@@ -67,14 +67,14 @@ impl Interpreter {
         thread.idle_visits <= MAX_IDLE_VISITS
     }
 
-    /// A thread has started the goal of an action, or a routine begins.
+    /// A thread has started an action's goal or a routine: resets the count.
     pub(super) fn has_begun_something(&mut self, thread: u64) {
         if let Some(thread) = self.threads.get_mut(&thread) {
             thread.idle_visits = 0;
         }
     }
 
-    /// A state has ended, as far as its thread is concerned.
+    /// Notes the end of a state; the thread follows its outcome next.
     pub(super) fn ended(&mut self, thread: u64, state: StateId, outcome: impl Into<String>, reason: String) {
         if let Some(thread) = self.threads.get_mut(&thread) {
             thread.todo = Todo::Ended { state, outcome: outcome.into(), reason };
@@ -89,7 +89,7 @@ impl Interpreter {
             return;
         }
         self.forget_passed_over(program, thread, Some(id));
-        // One node: it looks itself at what it requires.
+        // A node checks its preconditions itself.
         let begins_routine = state.is_routine() && self.routine_of(thread).is_none();
         if begins_routine || matches!(state.kind, StateKind::Action { .. }) {
             return self.begin(context, thread, id, &path);
@@ -102,12 +102,12 @@ impl Interpreter {
         self.enter_composite(context, thread, id, path);
     }
 
-    /// Whether a thread is not just at the beginning of a routine of the window, whose visit the window has counted.
+    /// False only at the entry of a routine of the window, whose visit the window has counted already.
     fn is_inside(&self, thread: u64) -> bool {
         self.threads.get(&thread).is_some_and(|thread| !thread.frames.is_empty() || thread.routine.is_none())
     }
 
-    /// A composite state is entered; what it requires holds.
+    /// Enters a composite state whose preconditions hold.
     pub(super) fn enter_composite(&mut self, context: &mut Context<'_>, thread: u64, id: StateId, path: String) {
         let program = context.program;
         let state = program.state(id);
@@ -171,7 +171,7 @@ impl Interpreter {
         }
     }
 
-    /// A decision is no instance here; it is noted for what later runs learn.
+    /// Logs a decision, which has no instance of its own here, so that later runs learn from it.
     pub(super) fn decided(&self, context: &mut Context<'_>, path: &str, decision: String) {
         context.note(Note::Decided { instance: InstanceId(0), path: path.to_owned(), decision });
     }
@@ -182,7 +182,7 @@ impl Interpreter {
         }
     }
 
-    /// The path of a state visited now.
+    /// Counts a visit of a state; returns its path.
     fn visit(&mut self, thread: u64, id: StateId, name: &str) -> String {
         let Some(frame) = self.threads.get_mut(&thread).and_then(|thread| thread.frames.last_mut()) else {
             return name.to_owned();
@@ -196,7 +196,7 @@ impl Interpreter {
         }
     }
 
-    /// A loop ends before its first iteration. Its variables are gone.
+    /// A loop fails before its first iteration; its variables are removed.
     fn fail_at_its_list(&mut self, id: u64, state: StateId, base: usize, reason: String) {
         if let Some(thread) = self.threads.get_mut(&id) {
             thread.variables.truncate(base);
@@ -204,14 +204,14 @@ impl Interpreter {
         self.ended(id, state, ABORTED, reason);
     }
 
-    /// A state has ended well and gives this.
+    /// Stores the outputs of a state that has ended well.
     pub(super) fn write(&mut self, id: StateId, outputs: Outputs) {
         self.earlier.remove(&id);
         self.outputs.insert(id, outputs);
     }
 
-    /// What an iteration has passed over on its way to a state of the body, or to its end, gives nothing in it. What comes only later is still that
-    /// of the iteration before.
+    /// Removes old outputs of body states that this iteration has passed over on its way to `to`, or to its end. Outputs of states that may still
+    /// come stay those of the iteration before.
     fn forget_passed_over(&mut self, program: &Program, thread: u64, to: Option<StateId>) {
         if self.earlier.is_empty() {
             return;
@@ -229,7 +229,7 @@ impl Interpreter {
         }
     }
 
-    /// What the states inside have written in an earlier activation is not seen in this one.
+    /// Removes the outputs that states inside wrote in an earlier activation.
     fn forget_inside(&mut self, program: &Program, id: StateId) {
         for child in program.state(id).children() {
             self.outputs.remove(&child);
@@ -300,7 +300,7 @@ impl Interpreter {
                         self.leave_list(context, id, SUCCESS.to_owned(), String::new());
                     }
                     Err(error) => {
-                        // It fails as the state, not by an outcome of its body.
+                        // The loop itself fails, not a state of its body.
                         if let Some(thread) = self.threads.get_mut(&id)
                             && let Some(frame) = thread.frames.pop()
                         {
@@ -345,7 +345,6 @@ impl Interpreter {
         }
     }
 
-    /// Follows the outcome of a state that has ended.
     fn follow(&mut self, context: &mut Context<'_>, id: u64, state: StateId, outcome: String, reason: String) {
         self.end_routine(context, id, state, &outcome);
         if self.goes_on_out(context, id, state, &outcome, &reason) {
@@ -356,7 +355,7 @@ impl Interpreter {
         };
         let (owner, list) = (context.program.state(frame.owner), frame.list);
         if matches!(owner.kind, StateKind::Concurrency { .. }) {
-            // A region ends as its state does.
+            // A region has one state and ends as it does.
             return self.set(id, Todo::Done { outcome, reason });
         }
         if is_failure(&outcome)
@@ -381,7 +380,7 @@ impl Interpreter {
         }
     }
 
-    /// Why a list ends as it does. What comes behind a failure, and ends well, has no reason of its own to tell.
+    /// Reason with which a list ends: that of its last failure, if the ending state itself gives none. A success has no reason.
     fn because(&self, id: u64, outcome: &str, reason: String) -> String {
         if outcome == SUCCESS {
             return String::new();
@@ -393,7 +392,7 @@ impl Interpreter {
         }
     }
 
-    /// The innermost list has ended, and with it the state around it.
+    /// Leaves the innermost list, and with it the state around it.
     fn leave_list(&mut self, context: &mut Context<'_>, id: u64, outcome: String, reason: String) {
         let Some(frame) = self.threads.get_mut(&id).and_then(|thread| thread.frames.pop()) else { return };
         self.exit(context, id, frame.owner, &frame.path, frame.variables, outcome, reason);

@@ -1,5 +1,5 @@
-//! Simulated annealing over the order in which tasks are served: the search where some of the tasks are speculative, which every
-//! dispatch serves last.
+//! Simulated annealing over the order in which tasks are served. It is used when some tasks are speculative, because every dispatch
+//! serves these last.
 //!
 //! A schedule made by dispatch is the order in which its tasks begin: dispatched in that order, it comes out the same. So the order
 //! is the solution that is searched: a step moves one task to another place in it, simulates the dispatch, and keeps the
@@ -10,20 +10,20 @@
 use super::dice::Dice;
 use super::network::Place;
 
-/// From the highest temperature to the lowest in so many steps; the next cycle begins with the best order.
+/// Steps from the highest temperature to the lowest; the next cycle begins with the best order.
 const CYCLE: u32 = 4_000;
-/// An end that is later by this share of the whole is kept with probability 1/e at the beginning of a cycle …
+/// At the beginning of a cycle, an end that is later by this share of the total time is accepted with probability 1/e …
 const HOT: f64 = 0.01;
-/// … and this one at its end.
+/// … and at its end, one that is later by this share.
 const COLD: f64 = 0.0005;
 
-/// The order that is changed.
+/// The order and the state of the annealing.
 #[derive(Debug, Clone)]
 pub(super) struct Annealing {
     dice: Dice,
     current: Vec<Place>,
     current_end: u64,
-    /// In the present cycle.
+    /// Steps in the present cycle.
     steps: u32,
 }
 
@@ -32,7 +32,7 @@ impl Annealing {
         Annealing { dice: Dice(seed), current: order.to_vec(), current_end: end, steps: 0 }
     }
 
-    /// The next order to try.
+    /// Proposes the next order.
     pub(super) fn vary(&mut self, tried: &mut Vec<Place>, best: &[Place], best_end: u64) {
         if self.steps == CYCLE {
             self.steps = 0;
@@ -49,7 +49,7 @@ impl Annealing {
         }
     }
 
-    /// What came of it: the order in which its tasks began, and when they had ended.
+    /// Accepts or rejects an order, given the simulated sequence and its end.
     pub(super) fn judge(&mut self, sequence: &[Place], end: u64, best_end: u64) {
         let temperature = HOT * (COLD / HOT).powf(f64::from(self.steps) / f64::from(CYCLE)) * best_end as f64;
         self.steps += 1;

@@ -1,24 +1,24 @@
-//! The disjunctive graph of a project whose contested resources can only be had by one task at a time: per resource the order of its
-//! tasks, and the longest paths that follow from it.
+//! The disjunctive graph of a project in which each contested resource serves one task at a time: per resource (machine) the order
+//! of its tasks, and the longest paths that follow from the orders.
 //!
-//! Orders of machines and heads and tails are those of the job shop (Balas 1969); tasks may wait for several others.
+//! Machine orders, heads and tails as in the job shop (Balas 1969); a task may have several predecessors.
 
 use super::project::Project;
 
 /// No neighbour.
 pub(super) const NONE: u32 = u32::MAX;
 
-/// The orders, and what follows from them.
+/// The machine orders, and the paths that follow from them.
 #[derive(Debug, Clone)]
 pub(super) struct Disjunctive {
     pub(super) project: Project,
-    /// By task; [`NONE`] where it needs nothing that is contested.
+    /// By task, its machine; [`NONE`] if it needs no contested resource.
     pub(super) machine: Vec<u32>,
     /// By machine, its tasks in order.
     pub(super) orders: Vec<Vec<u32>>,
     /// By task, its place in the order of its machine.
     pub(super) position: Vec<u32>,
-    /// By task, when it is ready at the earliest, whatever the orders.
+    /// By task, its earliest start, whatever the orders.
     pub(super) releases: Vec<u64>,
     /// By task, the longest path to it.
     pub(super) heads: Vec<u64>,
@@ -26,12 +26,12 @@ pub(super) struct Disjunctive {
     pub(super) tails: Vec<u64>,
     sorted: Vec<u32>,
     open: Vec<u32>,
-    /// When everything has ended.
+    /// Makespan: when everything has ended.
     pub(super) end: u64,
 }
 
 impl Disjunctive {
-    /// `None` where a resource can be had by two tasks at a time, or a task needs two that are contested.
+    /// `None` if a resource can serve two tasks at a time, or if a task needs two contested resources.
     pub(super) fn of(project: Project) -> Option<Disjunctive> {
         let size = project.len();
         let mut least = project.capacity.clone();
@@ -70,7 +70,7 @@ impl Disjunctive {
         })
     }
 
-    /// Orders the tasks of each machine as in a list in which each task comes after those it waits for.
+    /// Orders the tasks of each machine as in `list`, in which each task comes after its predecessors.
     pub(super) fn order_by(&mut self, list: &[u32]) {
         self.orders.iter_mut().for_each(Vec::clear);
         for task in list {
@@ -82,7 +82,7 @@ impl Disjunctive {
         self.measure();
     }
 
-    /// Orders the tasks of each machine as they were ordered before.
+    /// Restores earlier machine orders.
     pub(super) fn order_as(&mut self, orders: &[Vec<u32>]) {
         for (order, kept) in self.orders.iter_mut().zip(orders) {
             order.clone_from(kept);
@@ -93,13 +93,11 @@ impl Disjunctive {
         self.measure();
     }
 
-    /// The task before another one on its machine.
     pub(super) fn machine_before(&self, task: u32) -> u32 {
         let (machine, position) = (self.machine[task as usize], self.position[task as usize]);
         if machine == NONE || position == 0 { NONE } else { self.orders[machine as usize][position as usize - 1] }
     }
 
-    /// The task behind another one on its machine.
     pub(super) fn machine_behind(&self, task: u32) -> u32 {
         let (machine, position) = (self.machine[task as usize], self.position[task as usize]);
         let order = if machine == NONE { None } else { self.orders.get(machine as usize) };
@@ -110,14 +108,14 @@ impl Disjunctive {
         self.project.durations[task as usize]
     }
 
-    /// When those have ended that a task waits for, whatever its machine does.
+    /// When the predecessors of a task have ended, whatever its machine does.
     pub(super) fn ready(&self, task: u32) -> u64 {
         let before = self.project.before.of_place(task).iter();
         let ends = before.map(|before| self.heads[*before as usize] + self.duration(*before));
         ends.max().unwrap_or(0).max(self.releases[task as usize])
     }
 
-    /// The longest path through what waits for a task, whatever its machine does.
+    /// The longest path through the successors of a task, whatever its machine does.
     pub(super) fn rest(&self, task: u32) -> u64 {
         let behind = self.project.behind.of_place(task).iter();
         behind.map(|behind| self.tails[*behind as usize] + self.duration(*behind)).max().unwrap_or(0)
@@ -137,7 +135,7 @@ impl Disjunctive {
         self.measure();
     }
 
-    /// Works out heads, tails and the end. The orders must not contradict what waits for what.
+    /// Computes heads, tails and the end. The orders must not contradict the precedences.
     pub(super) fn measure(&mut self) {
         self.sorted.clear();
         for task in 0..self.project.len() as u32 {

@@ -1,16 +1,16 @@
-//! When to look ahead anew: after a good part of what was planned has changed, or something took another time than was planned with.
+//! When to look ahead again: after a good part of the plan has changed, or when a duration differed from its estimate.
 
 use crate::protocol::{Command, Note};
 use ratn_model::id::InstanceId;
 use ratn_model::time::Timestamp;
 use std::collections::BTreeMap;
 
-/// It is looked ahead again when as many instances have appeared, ended or gone as this part of those planned.
+/// Look-ahead is due again when the instances that appeared, ended or left reach this part (1/4) of the planned ones.
 const PART: usize = 4;
-/// What differs from its estimate by less than this share of it is no surprise.
+/// A duration that differs from its estimate by less than this share is no surprise.
 const SURPRISE: f64 = 0.02;
 
-/// Counts what changes in a window since it was looked ahead.
+/// Counts the changes of a window since the last look-ahead.
 #[derive(Debug, Clone, Default)]
 pub struct Lookout {
     planned: usize,
@@ -21,7 +21,7 @@ pub struct Lookout {
 }
 
 impl Lookout {
-    /// Takes note of what the executive commands.
+    /// Counts the commands of the executive.
     pub fn observe(&mut self, now: Timestamp, commands: &[Command]) {
         for command in commands {
             match command {
@@ -46,24 +46,24 @@ impl Lookout {
         }
     }
 
-    /// Whether so much has changed that it is worth looking ahead as if for the first time.
+    /// Whether so much has changed that a full look-ahead is worthwhile.
     pub fn is_due(&self) -> bool {
         self.changes > 0 && self.changes * PART >= self.planned
     }
 
-    /// Whether something ended earlier or later than it was planned with: worth a short look.
+    /// Whether a goal ended earlier or later than planned: worth a short look-ahead.
     pub fn is_surprised(&self) -> bool {
         self.is_surprised
     }
 
-    /// It is being looked ahead, for so many tasks.
+    /// A full look-ahead begins, for so many tasks.
     pub fn looks(&mut self, tasks: usize) {
         self.planned = tasks;
         self.changes = 0;
         self.is_surprised = false;
     }
 
-    /// It is being looked ahead shortly.
+    /// A short look-ahead begins.
     pub fn glances(&mut self) {
         self.is_surprised = false;
     }

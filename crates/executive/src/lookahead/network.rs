@@ -1,4 +1,4 @@
-//! A problem as numbers: what the inner loop of a look-ahead works on.
+//! A problem as numbers, for the inner loop of look-ahead.
 
 use super::problem::{Problem, ProblemError};
 use std::cmp::Reverse;
@@ -8,10 +8,10 @@ use std::collections::{BTreeMap, BinaryHeap};
 pub(super) type Place = u32;
 
 pub(super) const NANOSECONDS: f64 = 1e9;
-/// A task takes at most this long: a hundred years add up without overflow.
+/// Upper limit of a duration: the durations of a hundred years add up without overflow.
 const LONGEST_S: f64 = 1e8;
 
-/// Lists of numbers, one per task, in one piece.
+/// One list of numbers per task, all in one vector.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Lists<T> {
     bounds: Vec<u32>,
@@ -35,15 +35,15 @@ impl<T> Lists<T> {
     }
 }
 
-/// Tasks that do not ask before others have begun: who, and for whom.
+/// Tasks that are held back: each with the tasks that must begin before it asks.
 pub(super) type Holds = Vec<(Place, Vec<Place>)>;
 
-/// What one task takes of one kind.
+/// A task's demand for one resource kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Demand {
     /// The kind, as an index.
     pub(super) kind: u32,
-    /// In thousandths, as everything here that is an amount.
+    /// In thousandths of a unit, as all amounts here.
     pub(super) units: u64,
 }
 
@@ -57,13 +57,13 @@ pub(super) struct Network {
     pub(super) demands: Lists<Demand>,
     pub(super) before: Lists<Place>,
     pub(super) behind: Lists<Place>,
-    /// Each after those it waits for, else in program order.
+    /// A topological order, else program order.
     pub(super) order: Vec<Place>,
-    /// Who is held back now.
+    /// The holds that are in force now.
     pub(super) holds: Holds,
     /// By kind, in thousandths of a unit.
     pub(super) capacity: Vec<u64>,
-    /// In nanoseconds, with its own duration; plain dispatch goes by it.
+    /// Longest remaining path in nanoseconds, including the task; priority of plain dispatch.
     pub(super) remaining: Vec<u64>,
 }
 
@@ -104,7 +104,7 @@ impl Network {
                     *units.entry(*kind).or_default() += count.thousandths();
                 }
             }
-            // More than there is can never be granted; the executive hears of that otherwise.
+            // A demand above the capacity is never granted; the resource manager tells the executive so.
             units.into_iter().map(|(kind, units)| Demand { kind, units: units.min(capacity[kind as usize]) }).collect()
         };
         let places = |list: &[usize]| list.iter().map(|at| *at as Place).collect::<Vec<Place>>();
@@ -126,8 +126,8 @@ impl Network {
         }
     }
 
-    /// No schedule ends earlier, in nanoseconds: by the longest path, and by what each kind has to do, with the shortest way there
-    /// and from there on.
+    /// Lower bound of the makespan, in nanoseconds: by the longest path, and by the work of each kind with the shortest way to and
+    /// from it.
     pub(super) fn bound(&self) -> u64 {
         let places = || 0..self.len() as Place;
         let heads = self.heads();
@@ -153,7 +153,7 @@ impl Network {
         loads.max().unwrap_or(0).max(path)
     }
 
-    /// The longest path to each, without its own duration.
+    /// The longest path to each task, without its own duration.
     fn heads(&self) -> Vec<u64> {
         let mut heads = vec![0; self.len()];
         for place in &self.order {
@@ -169,7 +169,7 @@ impl Network {
         self.durations.len()
     }
 
-    /// The order, and remaining paths from its end on; a task that waits for itself, if there is one.
+    /// Computes the order and the remaining paths; returns a task that waits for itself, if there is one.
     fn measure(&mut self) -> Option<Place> {
         let size = self.len();
         let mut open: Vec<u32> = (0..size).map(|at| self.before.of_place(at as Place).len() as u32).collect();

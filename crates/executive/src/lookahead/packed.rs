@@ -1,12 +1,11 @@
-//! Amounts of several kinds in few machine words: one subtraction takes them all, and one says whether there is enough of each.
+//! Amounts of several kinds in a few machine words: one subtraction takes all amounts, and one test tells whether there is enough of each.
 //!
-//! Each kind has a lane of bits that holds what there can be of it at the most, counted in the greatest unit that divides all its amounts, and
-//! above them a guard bit. The guard bits of what is free are set: where a subtraction clears one, there was too little of that kind
+//! Each kind has a lane of bits for its largest amount, counted in the largest unit that divides all its amounts, and above it a guard bit.
+//! The guard bits of a free amount are set: a subtraction that clears one shows that there was too little of that kind
 //! (Lamport, Multiple byte processing with full-word instructions, 1975).
 
 use super::network::Demand;
 
-/// Where the lane of each kind is.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Lanes {
     /// By kind.
@@ -23,7 +22,7 @@ struct Lane {
 }
 
 impl Lanes {
-    /// Lanes for up to so much of each kind, and for these demands.
+    /// Lanes for amounts up to `capacity`, and for these demands.
     pub(super) fn of<'a>(capacity: &[u64], demands: impl Iterator<Item = &'a Demand>) -> Lanes {
         let mut units = capacity.to_vec();
         for demand in demands {
@@ -47,12 +46,12 @@ impl Lanes {
         Lanes { lanes: lanes.collect(), guards }
     }
 
-    /// Words that amounts of all kinds take.
+    /// Number of words for the amounts of all kinds.
     pub(super) fn words(&self) -> usize {
         self.guards.len()
     }
 
-    /// What is wanted, as words.
+    /// Demands as words.
     pub(super) fn wanted(&self, demands: &[Demand]) -> Vec<u64> {
         let mut words = vec![0; self.words()];
         for demand in demands {
@@ -62,7 +61,6 @@ impl Lanes {
         words
     }
 
-    /// What is free of each kind, as words.
     pub(super) fn free(&self, amounts: &[u64]) -> Vec<u64> {
         let mut words = self.guards.clone();
         for (lane, amount) in self.lanes.iter().zip(amounts) {

@@ -1,29 +1,29 @@
 //! Two populations of activity lists, crossed in turn: the search where a resource has several units.
 //!
-//! One population's schedules begin everything as early as possible, the other's end everything as late as possible. The children of one are
-//! scheduled in the other's way and join it (Debels, Vanhoucke: A bi-population based genetic algorithm for the resource-constrained
-//! project scheduling problem, 2005): each generation justifies the one before, for one schedule per child where double
-//! justification takes two more. A child takes the place of the one that is where its mother is, unless that is better. When
-//! nothing better comes of them, all are drawn anew but the best.
+//! The schedules of one population begin everything as early as possible, those of the other end everything as late as possible. The children of
+//! one population are scheduled in the direction of the other and join it (Debels, Vanhoucke: A bi-population based genetic algorithm for the
+//! resource-constrained project scheduling problem, 2005). So each generation justifies the one before it with one schedule per child, where double
+//! justification needs two more. A child replaces the individual at its mother's position in that population, unless that one is better. When there
+//! is no improvement for long, all but the best are replaced by random ones.
 
 use super::project::{Plan, Project};
 use super::schedule::Scheduler;
 use super::variation::{Direction, Variation};
 
-/// How many each population has: up to 60 tasks as many as Hartmann's has for some thousand schedules, of more two for each three of them up to the
-/// second number. Measured on PSPLIB: with 3,000 schedules twice as many are worse for 120 tasks, with 30,000 a little better.
+/// Size of each population: for up to 60 tasks as many as Hartmann's for some thousand schedules; for more tasks two for each three of them, up to
+/// the second number. Measured on PSPLIB: with 3,000 schedules twice as many are worse for 120 tasks, with 30,000 a little better.
 const SIZES: [usize; 2] = [40, 80];
-/// After so many schedules for each of a population without anything better all but the best are drawn anew.
+/// After this many schedules per individual without an improvement, all but the best are replaced by random ones.
 const PATIENCE: usize = 75;
-/// A list that is given is scheduled, and its schedule justified to the end and back.
+/// A given list costs three schedules: its own, and its justification to the end and back.
 const SCHEDULES_OF_GIVEN: usize = 3;
 
-/// A schedule.
+/// One schedule of a population.
 #[derive(Debug, Clone)]
 struct Individual {
-    /// Its tasks in the order in which the schedule has them from the side on which the other population begins.
+    /// Its tasks, in the order of the schedule seen from the side on which the other population begins.
     list: Vec<u32>,
-    /// How long it takes.
+    /// Makespan.
     takes: u64,
 }
 
@@ -33,26 +33,26 @@ pub(super) struct Population {
     project: Project,
     scheduler: Scheduler,
     variation: Variation,
-    /// How many are in each.
+    /// Number of individuals in each.
     size: usize,
-    /// Those that were scheduled forward.
+    /// Individuals that were scheduled forward.
     early: Vec<Individual>,
-    /// Those that were scheduled backward.
+    /// Individuals that were scheduled backward.
     late: Vec<Individual>,
     /// In which direction the present generation of children is scheduled.
     direction: Direction,
     /// The next mother.
     mother: usize,
-    /// Lists that are still to be scheduled, the first last.
+    /// Given lists that are still to be scheduled; the first one stands last.
     given: Vec<Vec<u32>>,
-    /// Schedules that were made since something was found that is better.
+    /// Schedules since the last improvement.
     in_vain: usize,
     child: Vec<u32>,
     /// When each task begins in the best schedule.
     best: Vec<u64>,
     best_list: Vec<u32>,
     best_end: u64,
-    /// Of the best that was handed out.
+    /// Makespan of the best schedule that was handed out.
     told_end: u64,
 }
 
@@ -81,11 +81,11 @@ impl Population {
         }
     }
 
-    /// The lists, the best first.
+    /// The lists of both populations, the best first.
     pub(super) fn lists(&self) -> Vec<Vec<u32>> {
         let mut early: Vec<&Individual> = self.early.iter().collect();
         early.sort_by_key(|individual| individual.takes);
-        // What is in the order of the ends, the last first, is backwards in an order in which it could begin.
+        // A list sorted by ends, the last first, becomes a possible order of begins when it is reversed.
         let early = early.into_iter().map(|individual| individual.list.iter().rev().copied().collect());
         let best = (!self.best_list.is_empty()).then(|| self.best_list.clone());
         best.into_iter().chain(early).chain(self.given.iter().rev().cloned()).take(self.size).collect()
@@ -96,7 +96,7 @@ impl Population {
         &self.project
     }
 
-    /// Makes so many schedules or a few more, until one ends at `bound`; the best, if it is better than all before.
+    /// Makes at least `schedules` schedules, unless one reaches `bound`; returns the best schedule if it is new.
     pub(super) fn step(&mut self, schedules: usize, bound: u64) -> Option<Plan> {
         let mut made = 0;
         while made < schedules && self.best_end > bound {
@@ -116,7 +116,7 @@ impl Population {
         (self.best_end < std::mem::replace(&mut self.told_end, self.best_end)).then(|| self.project.plan_of(&self.best))
     }
 
-    /// A given list joins the early ones; how many schedules that took.
+    /// A given list joins the early population; returns the number of schedules made.
     fn take(&mut self, list: Vec<u32>) -> usize {
         self.child = list;
         let end = self.scheduler.forward(&self.project, &self.child);
@@ -126,7 +126,7 @@ impl Population {
         SCHEDULES_OF_GIVEN
     }
 
-    /// A drawn list joins the early ones, one in two by each scheme; how many schedules that took.
+    /// A random list joins the early population, half of them by each scheme; returns the number of schedules made.
     fn draw(&mut self) -> usize {
         self.variation.draw(&self.project, &mut self.child);
         let is_parallel = self.early.len().is_multiple_of(2);
@@ -142,7 +142,7 @@ impl Population {
         self.early.push(Individual { list: self.child.clone(), takes });
     }
 
-    /// A child of the next mother and the better of two others joins the other population; how many schedules that took.
+    /// A child of the next mother and of the better of two others joins the other population; returns the number of schedules made.
     fn bear(&mut self) -> usize {
         let Population { project, variation, child, direction, .. } = self;
         let (parents, number) = match direction {
@@ -194,7 +194,7 @@ impl Population {
         made
     }
 
-    /// Keeps the schedule made last, of the child, if it is better.
+    /// Keeps the child's schedule, made last, if it is better than the best.
     fn note(&mut self, end: u64) {
         if end < self.best_end {
             self.best_end = end;
@@ -205,7 +205,7 @@ impl Population {
         }
     }
 
-    /// Nothing better comes of them any more: the best stays.
+    /// No more improvement: replaces all but the best by random ones.
     fn begin_anew(&mut self) {
         self.early.clear();
         self.late.clear();

@@ -1,4 +1,4 @@
-//! The scheduling problem of a look-ahead: the nodes that have not ended, what they wait for and what they occupy.
+//! The scheduling problem of look-ahead: the nodes that have not ended, what they wait for and which resources they need.
 
 use ratn_model::id::InstanceId;
 use ratn_model::resource::Quantity;
@@ -9,61 +9,61 @@ use std::collections::BTreeMap;
 pub struct Problem {
     /// In program order.
     pub tasks: Vec<Task>,
-    /// How much of each resource kind there is, whoever holds it; of a kind that is not listed there is enough.
+    /// Capacity of each resource kind, including what is in use; a kind that is not listed has no limit.
     pub capacity: BTreeMap<String, Quantity>,
 }
 
 /// An instance that has not ended.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Task {
-    /// Which.
+    /// The instance.
     pub instance: InstanceId,
-    /// How long it takes, of a running one how long it still takes, in seconds of the robot's time; 0 of what only decides.
+    /// Duration, of a running task the remaining one, in seconds of the robot's time; 0 for markers.
     pub duration_s: f64,
-    /// It holds its resources already.
+    /// It already holds its resources.
     pub is_running: bool,
-    /// What it blocks: kind and amount, all at once, from its begin to its end.
+    /// The resources that it blocks from begin to end: kind and amount, acquired all at once.
     pub demands: Vec<(String, Quantity)>,
-    /// The tasks that must have ended before it may ask for resources, as places in [`Problem::tasks`]: producers of its inputs, the writers
-    /// of what it reads, and for a PIA everything that must have ended before it.
+    /// Its predecessors, as places in [`Problem::tasks`]: they must have ended before it may ask for resources. They are the producers of
+    /// its inputs, the writers of the facts that it reads, and for a PIA everything older.
     pub after: Vec<usize>,
-    /// By what was advised before, it does not ask for resources before these have begun, as places in [`Problem::tasks`].
+    /// By earlier advice it is held back until these have begun, as places in [`Problem::tasks`].
     pub held_for: Vec<usize>,
-    /// A condition on its path is undecided: it is served after everything for which none is.
+    /// A condition on its path is undecided: it is served after all certain tasks.
     pub is_speculative: bool,
-    /// By what it is served now, in seconds: the longest remaining path, or what was advised before.
+    /// Its present urgency in seconds: the longest remaining path, or earlier advice.
     pub urgency_s: f64,
-    /// How likely its path is, in (0, 1]; what is speculative is served by its urgency times this.
+    /// Probability of its path, in (0, 1]; a speculative task is served by its urgency times this.
     pub probability: f64,
 }
 
-/// A problem that cannot be planned.
+/// Error: the problem cannot be planned.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ProblemError {
     /// A duration or a probability is not a usable number.
     #[error("{instance}: its duration of {duration_s} s or its probability of {probability} is not a usable number")]
     Number {
-        /// Whose.
+        /// The instance.
         instance: InstanceId,
         /// The duration.
         duration_s: f64,
         /// The probability.
         probability: f64,
     },
-    /// It waits for a task that is not there.
+    /// A task waits for a task that does not exist.
     #[error("{instance} waits for task {after}, and there are only {tasks}")]
     Unknown {
-        /// Who.
+        /// The task that waits.
         instance: InstanceId,
-        /// For which place.
+        /// The place that it waits for.
         after: usize,
-        /// How many there are.
+        /// Number of tasks.
         tasks: usize,
     },
     /// Tasks wait for each other.
     #[error("{instance} waits, over others, for itself")]
     Circular {
-        /// One of them.
+        /// One of these tasks.
         instance: InstanceId,
     },
 }

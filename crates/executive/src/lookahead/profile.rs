@@ -1,37 +1,36 @@
-//! What is free of several kinds over time, as a step function: where does something fit first?
+//! The free amounts of several kinds over time, as a step function; finds the first gap into which a task fits.
 
 use super::packed::Lanes;
 use std::ops::Range;
 
-/// Of the kinds that have lanes; the last step never ends.
+/// A resource profile over the kinds that have lanes; the last step never ends.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Profile {
     lanes: Lanes,
     /// When a step begins; the first at 0.
     times: Vec<u64>,
-    /// Per step what is free, [`Lanes::words`] each.
+    /// The free amounts of each step, [`Lanes::words`] words each.
     free: Vec<u64>,
 }
 
 impl Profile {
-    /// With nothing in it yet.
     pub(super) fn new(lanes: Lanes) -> Profile {
         Profile { lanes, times: Vec::new(), free: Vec::new() }
     }
 
-    /// Begins anew.
+    /// Empties it.
     pub(super) fn clear(&mut self) {
         self.times.clear();
         self.free.clear();
     }
 
-    /// From a moment on, which is after all that were said, this is free.
+    /// Adds a step: from this moment on, later than all before, `free` is free.
     pub(super) fn then(&mut self, from: u64, free: &[u64]) {
         self.times.push(from);
         self.free.extend_from_slice(free);
     }
 
-    /// Takes so much for so long, at the earliest moment from `from` on at which it is free; that moment.
+    /// Takes an amount for a duration at the earliest possible moment from `from` on; returns that moment.
     pub(super) fn take(&mut self, wanted: &[u64], from: u64, duration: u64) -> u64 {
         let Some((start, first, last)) = self.earliest(wanted, from, duration) else { return from };
         if duration == 0 {
@@ -54,8 +53,8 @@ impl Profile {
         start
     }
 
-    /// The moment, the step in which it is and that in which the duration ends; none where it is never free. Whoever compiled the
-    /// demands bounded them.
+    /// The earliest moment, its step and the step in which the duration ends; `None` if it never fits, which bounded demands
+    /// exclude.
     fn earliest(&self, wanted: &[u64], from: u64, duration: u64) -> Option<(u64, usize, usize)> {
         let mut first = self.times.partition_point(|time| *time <= from) - 1;
         let (mut start, mut end, mut step) = (from, from.saturating_add(duration), first);
@@ -77,7 +76,7 @@ impl Profile {
         step * words..(step + 1) * words
     }
 
-    /// Another step begins at a moment within a step, with the same free.
+    /// Splits a step at a moment; both parts have the same free amounts.
     fn split(&mut self, step: usize, moment: u64) {
         self.times.insert(step + 1, moment);
         let (words, end) = (self.words_of(step), self.free.len());

@@ -1,27 +1,27 @@
-//! What is left to schedule: the tasks that have not begun, with what the running ones leave of the resources.
+//! The tasks that are left to schedule: those that have not begun, with the resources that running tasks leave free.
 //!
-//! Schedule generation and the disjunctive graph work on this. What never binds is left out: kinds of which all tasks together need no
-//! more than there is, and the running tasks themselves, which are releases and an occupied beginning.
+//! Schedule generation and the disjunctive graph work on this. What never constrains is left out: kinds with enough for all tasks at
+//! once, and the running tasks themselves, which become release times and resources in use at the beginning.
 
 use super::network::{Demand, Lists, Network, Place};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
 
-/// Tasks are numbered from 0 in here, in an order in which each comes after those it waits for.
+/// Tasks are numbered from 0 here, each after its predecessors.
 #[derive(Debug, Clone)]
 pub(super) struct Project {
     /// The task's place in the network.
     pub(super) places: Vec<Place>,
     pub(super) durations: Vec<u64>,
-    /// No earlier: running tasks that it waits for end then.
+    /// Release times: when the running tasks that a task waits for end.
     pub(super) releases: Vec<u64>,
     pub(super) before: Lists<u32>,
     pub(super) behind: Lists<u32>,
-    /// Of contested kinds only.
+    /// Demands for contested kinds only.
     pub(super) demands: Lists<Demand>,
-    /// By contested kind.
+    /// Capacity by contested kind.
     pub(super) capacity: Vec<u64>,
-    /// What running tasks hold until when.
+    /// What running tasks hold, and until when.
     pub(super) occupied: Vec<(u64, Demand)>,
     /// When the last running task ends.
     pub(super) running_end: u64,
@@ -82,7 +82,7 @@ impl Project {
         }
     }
 
-    /// The tasks in the order of a list of places, as far as what waits for what allows; what the list does not have comes last.
+    /// The tasks in the order of a list of places, as far as precedences allow; tasks that are not in the list come last.
     pub(super) fn list_of(&self, places: &[Place]) -> Vec<u32> {
         let ranks: BTreeMap<Place, usize> = places.iter().enumerate().map(|(rank, place)| (*place, rank)).collect();
         let rank = |task: u32| ranks.get(&self.places[task as usize]).copied().unwrap_or(usize::MAX);
@@ -102,7 +102,7 @@ impl Project {
         list
     }
 
-    /// A schedule, given when each task begins, in terms of places.
+    /// Converts the start times of tasks into a plan by places.
     pub(super) fn plan_of(&self, starts: &[u64]) -> Plan {
         let mut begins = vec![0; self.network_size];
         for (place, start) in self.places.iter().zip(starts) {
@@ -118,7 +118,7 @@ impl Project {
     }
 }
 
-/// By kind its number among those of which not everybody can have enough at once; and how much there is of these.
+/// By kind, its number among the contested kinds (those without enough for all tasks at once), and the capacities of these.
 fn contested(network: &Network) -> (Vec<Option<u32>>, Vec<u64>) {
     let mut wanted = vec![0_u128; network.capacity.len()];
     for demand in (0..network.len() as Place).flat_map(|place| network.demands.of_place(place)) {

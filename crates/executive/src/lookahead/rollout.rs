@@ -1,34 +1,34 @@
 //! One simulation of the rest of the window under the executive's dispatch.
 //!
-//! An instance asks for its resources as soon as what it waits for has ended. The resource manager serves requests by priority;
-//! a request that cannot be served reserves what is free of what it needs. Endings are handled one at a time: first those that
-//! became ready ask, then what has ended gives back what it held. Who is held back asks once those have begun that it is held back
-//! for. Nothing is allocated while it runs, unless it follows a plan: then whoever could begin earlier than planned is held
-//! back, which says by whom a dispatch has to be told to wait so that it comes to the plan.
+//! An instance asks for its resources as soon as its predecessors have ended. The resource manager serves requests by priority; a
+//! request that cannot be served reserves what is free of its demand. Endings are handled one at a time: first the tasks that became
+//! ready ask, then the ended task gives back its resources. A task that is held back asks once the others have begun. A run allocates
+//! no memory, unless it follows a plan. Then each task that could begin earlier than planned is held back; so the run finds the holds
+//! with which dispatch leads to the plan.
 
 use super::network::{Holds, Network, Place};
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-/// The state of a simulation; kept and used again by the next.
+/// The state of a simulation, reused by the next one.
 #[derive(Debug, Clone)]
 pub(super) struct Rollout {
     waits: Vec<u32>,
     free: Vec<u64>,
     reserved: Vec<u64>,
-    /// Those that ask, the most urgent first.
+    /// Tasks that ask for resources, the most urgent first.
     asking: Vec<Place>,
     became_ready: Vec<Place>,
-    /// By task, how many have not begun that it is held back for.
+    /// By task, how many tasks must still begin before it is released from its hold.
     held: Vec<u32>,
-    /// By task, who is held back for it.
+    /// By task, the tasks that are held back for it.
     holds: Vec<Vec<Place>>,
     has_begun: Vec<bool>,
-    /// When which ends; of the same moment, what began first.
+    /// Ends of running tasks; at the same moment, the one that began first.
     ending: BinaryHeap<Reverse<(u64, u32, Place)>>,
-    /// When it began.
+    /// By task, when it began.
     pub(super) began: Vec<u64>,
-    /// In the order in which they began.
+    /// The tasks in the order in which they began.
     pub(super) sequence: Vec<Place>,
 }
 
@@ -50,8 +50,8 @@ impl Rollout {
         }
     }
 
-    /// Simulates; `ranks` says by task who is served before whom, smaller first, and `holds` who is held back. The moment of the last
-    /// ending, in nanoseconds; the greatest there is where those held back wait for each other.
+    /// Simulates the dispatch with the priorities `ranks` (smaller first) and the given holds. Returns the moment of the last ending,
+    /// in nanoseconds; the greatest number if tasks that are held back wait for each other.
     pub(super) fn run(&mut self, network: &Network, ranks: &[u32], holds: &Holds) -> u64 {
         self.clear(network);
         for (place, held_for) in holds {
@@ -64,7 +64,7 @@ impl Rollout {
         if self.sequence.len() == network.len() { end } else { u64::MAX }
     }
 
-    /// Simulates a plan, which says by task when it begins; `ranks` is its order. Who has to be held back.
+    /// Simulates a plan, given by the begin of each task; `ranks` is its order. Returns the holds that lead to it.
     pub(super) fn holds_of_plan(&mut self, network: &Network, ranks: &[u32], plan: &[u64]) -> Holds {
         self.clear(network);
         let mut guide = Some(Guide { plan, holds: Vec::new() });
@@ -116,7 +116,7 @@ impl Rollout {
         now
     }
 
-    /// What became ready asks, the most urgent first; and what is no longer held back by what began so.
+    /// Tasks that became ready ask, the most urgent first; then those that these begins release from a hold.
     fn ask(&mut self, network: &Network, ranks: &[u32], now: u64, guide: &mut Option<Guide<'_>>) {
         while !self.became_ready.is_empty() {
             let mut added = false;
@@ -139,7 +139,7 @@ impl Rollout {
         }
     }
 
-    /// Who can be served is; who cannot reserves what there is of what it needs.
+    /// Serves the requests that can be served; the others reserve what is free of their demand.
     fn serve(&mut self, network: &Network, ranks: &[u32], now: u64, guide: &mut Option<Guide<'_>>) {
         self.reserved.fill(0);
         let mut kept = 0;
@@ -163,7 +163,7 @@ impl Rollout {
         self.asking.truncate(kept);
     }
 
-    /// Whether a task that could begin is planned for later, and there is somebody who is to begin before it.
+    /// Whether a task that could begin is planned for later, and another task is to begin before it: then it is held back.
     fn holds_back(&mut self, network: &Network, ranks: &[u32], guide: &mut Guide<'_>, place: Place, now: u64) -> bool {
         let at = place as usize;
         if guide.plan[at] <= now {
@@ -206,7 +206,7 @@ impl Rollout {
     }
 }
 
-/// A plan that is followed.
+/// The plan to follow.
 struct Guide<'a> {
     plan: &'a [u64],
     holds: Holds,

@@ -1,10 +1,10 @@
 //! Schedules made from lists: the serial schedule generation scheme for several resources with several units, and double
 //! justification.
 //!
-//! The scheme takes the tasks in the order of a list and begins each as early as those it waits for and the resources allow (Kolisch,
-//! Hartmann: Heuristic algorithms for the resource-constrained project scheduling problem, 1999): for some list the schedule is
-//! optimal. Justification moves all tasks as far to the end as they go, the last first, and then all to the beginning again, the
-//! first first; the schedule never becomes longer and often shorter (Valls, Ballestín, Quintanilla: Justification and RCPSP, 2005).
+//! The scheme takes the tasks in the order of a list and begins each as early as its predecessors and the resources allow (Kolisch,
+//! Hartmann: Heuristic algorithms for the resource-constrained project scheduling problem, 1999); at least one list gives an optimal
+//! schedule. Justification moves all tasks as far to the end as possible, the last first, and then all back to the beginning, the first
+//! first. The makespan never grows and often shrinks (Valls, Ballestín, Quintanilla: Justification and RCPSP, 2005).
 
 use super::network::{Demand, Lists};
 use super::packed::Lanes;
@@ -13,29 +13,29 @@ use super::project::Project;
 use std::cmp::Reverse;
 use std::collections::{BTreeSet, BinaryHeap};
 
-/// Makes schedules; its memory is used again by the next.
+/// Makes schedules; its memory is reused by the next one.
 #[derive(Debug, Clone)]
 pub(super) struct Scheduler {
     profile: Profile,
-    /// By task what it needs, as words; nothing of one that needs nothing.
+    /// By task, its demand as words; empty if it needs nothing.
     wanted: Lists<u64>,
-    /// What running tasks leave until when, the first end first; all is free after the last.
+    /// What running tasks leave free, and until when, sorted by time; after the last entry everything is free.
     left: Vec<(u64, Vec<u64>)>,
     all: Vec<u64>,
     /// When each task begins in the schedule made last.
     pub(super) starts: Vec<u64>,
-    /// Of the time from the end: when each ends.
+    /// Time from the end: when each task ends.
     mirrored: Vec<u64>,
     parallel: Parallel,
 }
 
-/// What the parallel scheme needs.
+/// State of the parallel scheme.
 #[derive(Debug, Clone, Default)]
 struct Parallel {
     free: Vec<u64>,
-    /// By task, how many have not ended that it waits for.
+    /// By task, the number of predecessors that have not ended.
     open: Vec<u32>,
-    /// Those that could begin if there were room, by rank.
+    /// Tasks that are ready but lack resources, by rank.
     asking: BTreeSet<(u32, u32)>,
     ending: BinaryHeap<Reverse<(u64, Ending)>>,
     ranks: Vec<u32>,
@@ -43,9 +43,9 @@ struct Parallel {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Ending {
-    /// What a running task holds is free.
+    /// A running task gives back what it holds.
     Occupied(u32),
-    /// The running tasks that a task waits for have ended.
+    /// The running predecessors of a task have ended.
     Released(u32),
     Task(u32),
 }
@@ -67,8 +67,8 @@ impl Scheduler {
         }
     }
 
-    /// Begins everything as early as possible, in the order of a list in which each task comes after those it waits for. When everything
-    /// has ended.
+    /// Serial scheme: begins every task as early as possible, in the order of `list`, in which each task comes after its predecessors.
+    /// Returns the makespan.
     pub(super) fn forward(&mut self, project: &Project, list: &[u32]) -> u64 {
         self.profile.clear();
         let mut from = 0;
@@ -89,8 +89,7 @@ impl Scheduler {
         end
     }
 
-    /// Begins at each moment what can begin then, in the order of a list as above, as dispatch does (the parallel scheme). When everything
-    /// has ended.
+    /// Parallel scheme: begins at each moment whatever can begin then, in the order of `list`, as dispatch does. Returns the makespan.
     pub(super) fn parallel(&mut self, project: &Project, list: &[u32]) -> u64 {
         let Parallel { free, open, asking, ending, ranks } = &mut self.parallel;
         free.clone_from(&project.capacity);
@@ -107,7 +106,7 @@ impl Scheduler {
         open.clear();
         for task in 0..project.len() as u32 {
             let before = project.before.of_place(task).len() as u32;
-            // Running ones that it waits for count as one.
+            // All running predecessors count as one.
             open.push(before + 1);
             ending.push(Reverse((project.releases[task as usize], Ending::Released(task))));
         }
@@ -161,8 +160,7 @@ impl Scheduler {
         end
     }
 
-    /// Justifies the schedule made last to the end and again to the beginning. `list` becomes the tasks in the order in which they
-    /// begin. When everything has ended.
+    /// Double justification of the last schedule: to the end and back to the beginning. Sorts `list` by begin. Returns the makespan.
     pub(super) fn justify(&mut self, project: &Project, list: &mut [u32], end: u64) -> u64 {
         self.sort_from_end(project, list);
         let end = self.backward(project, list, end);
@@ -172,8 +170,8 @@ impl Scheduler {
         end
     }
 
-    /// Ends everything as late as possible, in the order of a list in which each task comes before those it waits for, where all has
-    /// to have ended at `end`. How long it takes.
+    /// Ends every task as late as possible before `end`, in the order of `list`, in which each task comes before its predecessors. Returns
+    /// the length of the schedule.
     pub(super) fn backward(&mut self, project: &Project, list: &[u32], end: u64) -> u64 {
         self.profile.clear();
         let mut from = 0;
@@ -200,9 +198,9 @@ impl Scheduler {
         takes
     }
 
-    /// Puts a list into the order in which its tasks end in the schedule made last, the last first.
+    /// Sorts a list by the ends of the last schedule, the last end first.
     pub(super) fn sort_from_end(&self, project: &Project, list: &mut [u32]) {
-        // Who waits for whom is also in the order of the numbers, which decides among tasks without a duration.
+        // Predecessors have smaller numbers, which decides among tasks of zero duration.
         let (starts, durations) = (&self.starts, &project.durations);
         list.sort_unstable_by_key(|task| {
             let at = *task as usize;
@@ -210,7 +208,7 @@ impl Scheduler {
         });
     }
 
-    /// Puts a list into the order in which its tasks begin in the schedule made last from the end, which takes so long.
+    /// Sorts a list by the begins of the last backward schedule, whose length is `takes`.
     pub(super) fn sort_from_begin(&self, project: &Project, list: &mut [u32], takes: u64) {
         let (mirrored, durations) = (&self.mirrored, &project.durations);
         list.sort_unstable_by_key(|task| {
@@ -219,7 +217,7 @@ impl Scheduler {
         });
     }
 
-    /// The earliest moment from `ready` on at which a task fits; what it needs is taken from then on.
+    /// Places a task at the earliest possible moment from `ready` on, and takes its resources.
     fn place(&mut self, task: u32, ready: u64, duration: u64) -> u64 {
         let wanted = self.wanted.of_place(task);
         if wanted.is_empty() {
@@ -228,13 +226,13 @@ impl Scheduler {
         self.profile.take(wanted, ready, duration)
     }
 
-    /// Puts a list into the order in which its tasks begin in the schedule made last.
+    /// Sorts a list by the begins of the last schedule.
     pub(super) fn sort(&self, list: &mut [u32]) {
         list.sort_unstable_by_key(|task| (self.starts[*task as usize], *task));
     }
 }
 
-/// What running tasks leave until when.
+/// What running tasks leave free, and until when.
 fn left(project: &Project, lanes: &Lanes) -> Vec<(u64, Vec<u64>)> {
     let mut ends: Vec<u64> = project.occupied.iter().map(|(until, _)| *until).filter(|until| *until > 0).collect();
     ends.sort_unstable();
@@ -242,7 +240,7 @@ fn left(project: &Project, lanes: &Lanes) -> Vec<(u64, Vec<u64>)> {
     let until = |end: u64| {
         let mut free = project.capacity.clone();
         for (_, demand) in project.occupied.iter().filter(|(until, _)| *until >= end) {
-            // There may be less of something than there was when it was granted.
+            // The capacity may have shrunk since the grant.
             free[demand.kind as usize] = free[demand.kind as usize].saturating_sub(demand.units);
         }
         (end, lanes.free(&free))

@@ -1,9 +1,9 @@
-//! The search for a better plan, and the advice that makes the executive's dispatch come to it.
+//! The search for a better plan, and the advice with which the executive's dispatch leads to it.
 //!
-//! How it searches depends on what there is to schedule: [`Tabu`] where contested resources can only be had by one task at a time, a
-//! [`Population`] of lists where they have several units, [`Annealing`] of the dispatch itself where tasks are speculative. Whatever is
-//! found is simulated under the very dispatch of the executive, with those held back that it needs to come to the plan, and counts
-//! only if that ends earlier. It is over early when nothing can be better.
+//! The method depends on the problem: [`Tabu`] where each contested resource serves one task at a time, a [`Population`] of lists where
+//! resources have several units, [`Annealing`] of the dispatch order where tasks are speculative. Every plan is simulated under the
+//! executive's own dispatch, with the holds that it needs, and counts only if it ends earlier. The search ends early when nothing can
+//! be better.
 
 use super::annealing::Annealing;
 use super::network::{Holds, NANOSECONDS, Network, Place};
@@ -16,28 +16,28 @@ use ratn_model::id::InstanceId;
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
-/// Two instances that begin at the same moment are advised this far apart, in seconds: the executive counts milliseconds.
+/// Two instances that begin at the same moment are advised this far apart, in seconds: the executive's resolution is milliseconds.
 const APART_S: f64 = 0.002;
-/// The same as a share of the whole, for what the executive's numbers can tell apart.
+/// The same as a share of the total time, because the executive's urgencies have limited precision.
 const APART_SHARE: f64 = 1.0 / 1_000_000.0;
 
-/// Who is held back may ask after so many times the time that was planned, whatever has become of the plan.
+/// A hold ends after this multiple of its planned time, even if the plan has failed.
 const GIVES_UP_AFTER: f64 = 2.0;
 
-/// A search that goes on as long as it is let.
+/// An anytime search: more steps may find better plans.
 #[derive(Debug, Clone)]
 pub struct Search {
     network: Network,
     instances: Vec<(InstanceId, f64)>,
     rollout: Rollout,
     ranks: Vec<u32>,
-    /// The order that is tried.
+    /// The order that is being tried.
     tried: Vec<Place>,
     best: Vec<Place>,
     best_holds: Holds,
     best_end: u64,
     plain_end: u64,
-    /// No order ends earlier than this.
+    /// Lower bound: no order ends earlier.
     bound: u64,
     method: Method,
 }
@@ -52,35 +52,35 @@ enum Method {
 /// The best plan found.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Advice {
-    /// When everything has ended, in seconds from now, if it is served so.
+    /// When everything has ended with this advice, in seconds from now.
     pub end_s: f64,
-    /// When it has ended as it is served now.
+    /// When everything has ended without it, in seconds from now.
     pub plain_s: f64,
-    /// For [`crate::protocol::Event::Advised`]: every task that has not begun.
+    /// For [`crate::protocol::Event::Advised`]: the urgency of every task that has not begun.
     pub urgency_s: Vec<(InstanceId, f64)>,
-    /// For the same: who is held back.
+    /// For the same: the instances held back.
     pub held: Vec<Held>,
 }
 
-/// An instance that does not ask for resources although it could, so that others get them first.
+/// A hold: the instance does not ask for resources although it could, so that others get them first.
 #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Held {
-    /// Which.
+    /// The instance.
     pub instance: InstanceId,
-    /// It may ask once these have begun.
+    /// The hold ends when these have begun.
     pub until_begun: Vec<InstanceId>,
-    /// It may ask after this time in any case, in seconds.
+    /// The hold ends after this time in any case, in seconds.
     pub at_most_s: f64,
 }
 
-/// Good orders of what is to be done, which a later search begins with.
+/// Good orders of the remaining work, with which a later search begins.
 #[derive(Debug, Clone, Default)]
 pub struct Memory {
     lists: Vec<Vec<InstanceId>>,
 }
 
 impl Memory {
-    /// The orders, of what is still to be done, as places.
+    /// The remembered orders of the tasks that still remain, as places.
     fn lists_of(&self, problem: &Problem) -> impl Iterator<Item = Vec<Place>> {
         let places: BTreeMap<InstanceId, Place> =
             problem.tasks.iter().enumerate().map(|(at, task)| (task.instance, at as Place)).collect();
@@ -89,7 +89,7 @@ impl Memory {
 }
 
 impl Search {
-    /// A search that knows the order of the present urgencies and that of the longest remaining path.
+    /// A search that starts with the order of the present urgencies and with that of the longest remaining path.
     ///
     /// # Errors
     /// [`ProblemError`] where the problem cannot be simulated.
@@ -97,7 +97,7 @@ impl Search {
         Search::remembering(problem, seed, &Memory::default())
     }
 
-    /// As [`Search::new`]; the search before, of what was to be done then, is gone on with.
+    /// As [`Search::new`], but continues with the results of an earlier search.
     ///
     /// # Errors
     /// As [`Search::new`].
@@ -111,7 +111,7 @@ impl Search {
         };
         let present = in_order(&|at| {
             let task = &problem.tasks[at];
-            // The bits of a positive float are in its order: what is unlikely is small and still tells itself from another.
+            // The bits of positive floats have the same order: small products of unlikely tasks stay distinguishable.
             i64::from(((task.urgency_s * task.probability).max(0.0) as f32).to_bits())
         });
         let longest = in_order(&|at| i64::try_from(network.remaining[at]).unwrap_or(i64::MAX));
@@ -144,7 +144,7 @@ impl Search {
         search.method = if search.network.is_speculative.contains(&true) {
             Method::Annealing(Annealing::new(seed, &search.best, search.best_end))
         } else {
-            // Those that are held back and wait for each other began nothing.
+            // Lists with tasks that never began (their holds wait for each other) are dropped.
             lists.retain(|list| list.len() == size);
             lists.extend(memory.lists_of(problem));
             lists.iter_mut().for_each(|list| *list = project.list_of(list));
@@ -156,7 +156,7 @@ impl Search {
         Ok(search)
     }
 
-    /// Makes so many schedules; whether one of them ends earlier than everything before.
+    /// Makes so many schedules; true if one of them ends earlier than all before.
     pub fn step(&mut self, orders: usize) -> bool {
         let before = self.best_end;
         if self.is_over() {
@@ -181,7 +181,7 @@ impl Search {
         self.best_end < before
     }
 
-    /// The orders that a later search goes on with.
+    /// The orders with which a later search goes on.
     pub fn memory(&mut self) -> Memory {
         let (lists, project) = match &mut self.method {
             Method::Annealing(_) => return Memory::default(),
@@ -197,12 +197,12 @@ impl Search {
         self.best_end <= self.bound || self.best.len() < 2
     }
 
-    /// When everything has ended as it is served now, in seconds from now.
+    /// When everything has ended with the present urgencies, in seconds from now.
     pub fn plain_s(&self) -> f64 {
         self.plain_end as f64 / NANOSECONDS
     }
 
-    /// No order ends earlier than this, in seconds from now.
+    /// Lower bound, in seconds from now: no order ends earlier.
     pub fn bound_s(&self) -> f64 {
         self.bound as f64 / NANOSECONDS
     }
@@ -224,7 +224,7 @@ impl Search {
             let before_end_s = end_s - self.rollout.began[at] as f64 / NANOSECONDS;
             let seconds = before_end_s.max(least_s);
             least_s = seconds + apart_s;
-            // The executive weighs what is speculative by its probability.
+            // The executive multiplies the urgency of a speculative task by its probability.
             let (instance, probability) = self.instances[at];
             urgency_s.push((instance, seconds / probability));
         }
@@ -238,7 +238,7 @@ impl Search {
         Advice { end_s, plain_s: self.plain_s(), urgency_s, held }
     }
 
-    /// Simulates another order; it is kept if it ends earlier.
+    /// Simulates another order; keeps it if it ends earlier.
     fn anneal(&mut self) {
         let Method::Annealing(annealing) = &mut self.method else { return };
         annealing.vary(&mut self.tried, &self.best, self.best_end);
@@ -251,7 +251,7 @@ impl Search {
         }
     }
 
-    /// Simulates the dispatch that comes to a plan; it is kept if it ends earlier.
+    /// Simulates the dispatch that leads to a plan; keeps it if it ends earlier.
     fn confirm(&mut self, plan: &Plan) {
         self.tried.clear();
         self.tried.extend((0..self.network.len() as Place).filter(|place| self.network.is_running[*place as usize]));
@@ -264,14 +264,14 @@ impl Search {
         }
     }
 
-    /// What was simulated last is the best.
+    /// Makes the last simulation the best.
     fn keep(&mut self, end: u64, holds: Holds) {
         self.best_end = end;
         self.best.clone_from(&self.rollout.sequence);
         self.best_holds = holds;
     }
 
-    /// When everything has ended that is served in the tried order.
+    /// The makespan when tasks are served in the tried order.
     fn simulate(&mut self, holds: &Holds) -> u64 {
         self.ranks_of_tried();
         self.rollout.run(&self.network, &self.ranks, holds)

@@ -1,22 +1,22 @@
-//! Tabu search over the orders of machines: the search where contested resources can only be had by one task at a time.
+//! Tabu search over machine orders, used when each contested resource serves one task at a time.
 //!
-//! A critical path is cut into blocks of tasks of one machine. Only moves of a task behind the last or before the first of its
-//! block, or of these two into the block, can shorten it (N6: Balas, Vazacopoulos, Guided local search with shifting
-//! bottleneck for job shop scheduling, 1998; Zhang, Li, Guan, Rao, 2007). The best of those that turn around nothing which was turned around lately is
-//! made, by an estimate of the longest path through what is moved. When nothing better has come for long, it goes on at one of the
-//! best schedules found, somewhat disturbed (as Nowicki, Smutnicki, A fast taboo search algorithm for the job shop problem, 1996, go back).
+//! A critical path is cut into blocks of tasks on one machine. The makespan can shrink only by moving a task behind the last or before the first of
+//! its block, or one of these two into the block (N6: Balas, Vazacopoulos, Guided local search with shifting bottleneck for job shop scheduling, 1998;
+//! Zhang, Li, Guan, Rao, 2007). The search makes the best move, by an estimate of the longest path through the moved tasks, that reverses no pair of
+//! tasks reversed recently. After long without improvement it goes back to one of the best schedules, slightly disturbed (as in Nowicki, Smutnicki, A
+//! fast taboo search algorithm for the job shop problem, 1996).
 
 use super::dice::Dice;
 use super::disjunctive::{Disjunctive, NONE};
 use super::project::{Plan, Project};
 
-/// Pairs that are remembered, at most.
+/// Limit of remembered pairs.
 const MAX_PAIRS: usize = 1 << 21;
-/// So many of the best orders are kept to go back to.
+/// Number of the best orders that are kept to go back to.
 const ELITE: usize = 8;
-/// Moves without anything better, for each task, before it goes back.
+/// Moves per task without improvement before it goes back.
 const PATIENCE_PER_TASK: usize = 10;
-/// A schedule that is gone back to is disturbed by at most so many moves.
+/// Limit of random moves that disturb a schedule after going back to it.
 const MAX_DISTURBANCE: usize = 12;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,7 +35,7 @@ pub(super) struct Tabu {
     offsets: Vec<usize>,
     /// By task, its number among those of its machine.
     local: Vec<u32>,
-    /// By pair of tasks of a machine: until which move the first must not be put before the second.
+    /// By pair of tasks of a machine: the move number until which the first must not be put before the second.
     forbidden: Vec<u32>,
     tenure: u32,
     moves: u32,
@@ -44,16 +44,16 @@ pub(super) struct Tabu {
     candidates: Vec<Move>,
     heads: Vec<u64>,
     moved: Vec<u32>,
-    /// Orders, and when they end.
+    /// The best orders, and their makespans.
     elite: Vec<(u64, Vec<Vec<u32>>)>,
     best: Vec<u64>,
     best_end: u64,
-    /// Of the best that was handed out.
+    /// Makespan of the best schedule that was handed out.
     told_end: u64,
 }
 
 impl Tabu {
-    /// Begins with the best of these lists, and keeps the others to go back to. `None` where this search does not apply: see [`Disjunctive::of`].
+    /// Begins with the best of these lists, and keeps the others to go back to. `None` if this search does not apply; see [`Disjunctive::of`].
     pub(super) fn new(project: Project, seed: u64, lists: &[Vec<u32>]) -> Option<Tabu> {
         let mut graph = Disjunctive::of(project)?;
         let mut elite: Vec<(u64, Vec<Vec<u32>>)> = Vec::new();
@@ -61,7 +61,7 @@ impl Tabu {
             graph.order_by(list);
             elite.push((graph.end, graph.orders.clone()));
         }
-        // The best is the last.
+        // The best stands last.
         elite.sort_by_key(|(end, _)| std::cmp::Reverse(*end));
         elite.drain(..elite.len().saturating_sub(ELITE));
         graph.order_as(&elite.last()?.1);
@@ -78,7 +78,7 @@ impl Tabu {
         if pairs > MAX_PAIRS {
             return None;
         }
-        // Zhang et al.: 10 and the jobs per machine, where the jobs are the tasks of a machine.
+        // Tabu tenure after Zhang et al.: 10 and the jobs per machine, where the jobs are the tasks of a machine.
         let machines = graph.orders.iter().filter(|order| !order.is_empty()).count().max(1);
         let jobs = graph.orders.iter().map(Vec::len).sum::<usize>() / machines;
         let mut tabu = Tabu {
@@ -126,7 +126,7 @@ impl Tabu {
         &self.graph.project
     }
 
-    /// Makes so many moves, until a schedule ends at `bound`; the best, if it is better than all before.
+    /// Makes so many moves, unless a schedule reaches `bound`; returns the best schedule if it is new.
     pub(super) fn step(&mut self, moves: usize, bound: u64) -> Option<Plan> {
         for _ in 0..moves {
             if self.best_end <= bound {
@@ -141,7 +141,7 @@ impl Tabu {
                     self.make(chosen);
                     self.note();
                 }
-                // No move can make this schedule shorter; another one may be.
+                // No move can shorten this schedule; another schedule may have such a move.
                 None if self.elite.len() > 1 => self.go_back(),
                 None => break,
             }
@@ -150,7 +150,7 @@ impl Tabu {
         is_better.then(|| self.graph.project.plan_of(&self.best))
     }
 
-    /// Keeps what is better than all before.
+    /// Keeps the schedule if it is the best so far.
     fn note(&mut self) {
         self.in_vain += 1;
         if self.graph.end < self.best_end {
@@ -164,10 +164,10 @@ impl Tabu {
         }
     }
 
-    /// Goes on at one of the best schedules.
+    /// Goes back to one of the best schedules.
     fn go_back(&mut self) {
         let Some(last) = self.elite.len().checked_sub(1) else { return };
-        // The best is gone back to half of the time.
+        // Half of the time it goes back to the best.
         let chosen = if self.dice.below(2) == 0 { last } else { self.dice.below(last + 1) };
         self.graph.order_as(&self.elite[chosen].1);
         self.forbidden.fill(0);
@@ -204,7 +204,7 @@ impl Tabu {
         }
     }
 
-    /// A longest path, chosen at random where there are several.
+    /// A critical path, chosen at random where there are several.
     fn find_path(&mut self) {
         let Tabu { graph, path, dice, .. } = self;
         path.clear();
@@ -223,14 +223,14 @@ impl Tabu {
         }
     }
 
-    /// The moves of the block between two places of the path.
+    /// The moves within the block between two places of the path.
     fn find_moves_in(&mut self, machine: u32, from: usize, to: usize) {
         let (is_first, is_last) = (from == 0, to + 1 == self.path.len());
         let (first, last) = (self.path[from], self.path[to]);
         let place = |tabu: &Tabu, task: u32| tabu.graph.position[task as usize];
         for at in from..=to {
             let task = self.path[at];
-            // Behind the last; at the very end of the path that gains nothing. The first goes into the block, too.
+            // Behind the last; at the very end of the path that gains nothing. The first task may also move into the block.
             if task != last && !is_last && self.may_follow(task, last) {
                 self.add(machine, place(self, task), place(self, last));
             }
@@ -255,7 +255,7 @@ impl Tabu {
         }
     }
 
-    /// No path leads from what waits for `task` to `last`, a later one of its machine.
+    /// Whether no path leads from the successors of `task` to `last`, a later task of its machine.
     fn may_follow(&self, task: u32, last: u32) -> bool {
         let graph = &self.graph;
         let reach = graph.tails[last as usize] + graph.duration(last);
@@ -265,7 +265,7 @@ impl Tabu {
         })
     }
 
-    /// No path leads from `first`, an earlier one of its machine, to what `task` waits for.
+    /// Whether no path leads from `first`, an earlier task of its machine, to the predecessors of `task`.
     fn may_precede(&self, task: u32, first: u32) -> bool {
         let graph = &self.graph;
         let end = graph.heads[first as usize] + graph.duration(first);
@@ -275,7 +275,7 @@ impl Tabu {
         })
     }
 
-    /// The best move that is not forbidden, or leads to something new; if all are forbidden, any.
+    /// The best move that is not tabu, or that leads to a new best; if all are tabu, any move.
     fn choose(&mut self) -> Option<Move> {
         let mut best: Option<(u64, Move)> = None;
         let mut alike = 0;
@@ -305,7 +305,7 @@ impl Tabu {
         best.map(|(_, chosen)| chosen)
     }
 
-    /// The longest path through the tasks that a move moves, with the heads and tails of all others as they are.
+    /// The longest path through the moved tasks, with heads and tails of all others unchanged.
     fn estimate(&mut self, Move { machine, from, to }: Move) -> u64 {
         let (low, high) = (from.min(to) as usize, from.max(to) as usize);
         let Tabu { graph, moved, heads, .. } = self;
@@ -336,7 +336,7 @@ impl Tabu {
         longest
     }
 
-    /// Whether a move puts something before another that was turned around lately.
+    /// Whether a move is tabu: it reverses a pair of tasks that was reversed recently.
     fn is_forbidden(&self, Move { machine, from, to }: Move) -> bool {
         let order = &self.graph.orders[machine as usize];
         let task = order[from as usize];
@@ -356,7 +356,7 @@ impl Tabu {
             + self.local[behind as usize] as usize
     }
 
-    /// Makes a move, and forbids to turn it around for a while.
+    /// Makes a move, and makes its reversal tabu for a while.
     fn make(&mut self, Move { machine, from, to }: Move) {
         self.moves += 1;
         let until = self.moves + self.tenure + self.dice.below(self.tenure as usize / 2 + 1) as u32;
@@ -372,7 +372,7 @@ impl Tabu {
     }
 }
 
-/// One of several, each as likely.
+/// One of several, each with the same probability.
 fn one_of(several: impl Iterator<Item = u32>, dice: &mut Dice) -> Option<u32> {
     let mut chosen = None;
     for (number, one) in several.enumerate() {

@@ -23,7 +23,7 @@ fn problem(tasks: Vec<Task>, capacity: &[(&str, u32)]) -> Problem {
     Problem { tasks, capacity: capacity.iter().map(|(kind, units)| ((*kind).to_owned(), (*units).into())).collect() }
 }
 
-/// Anything: chains and joins, several units, running and speculative tasks.
+/// A random problem: chains and joins, several units, running and speculative tasks.
 fn random(seed: u64) -> Problem {
     let mut dice = Dice(seed);
     let size = 2 + dice.below(40);
@@ -51,7 +51,7 @@ fn random(seed: u64) -> Problem {
 
 #[test]
 fn a_task_that_others_are_long_in_waiting_for_goes_first() {
-    // The machine could do the second first, on whose end nobody waits.
+    // The machine could do the second task first; nothing waits for the end of that one.
     let mut first = task(1, 2.0, "m", &[]);
     first.urgency_s = 1.0;
     let mut second = task(2, 3.0, "m", &[]);
@@ -141,8 +141,8 @@ fn nothing_to_do_is_over_at_once() {
     assert_eq!(search.best().urgency_s, Vec::new());
 }
 
-/// The shortest schedule, by trying all lists: tasks in the order of a list, each as early as those before it allow. Shares nothing
-/// with the search; whole seconds only.
+/// The shortest schedule, found by trying all lists: each task as early as the tasks before it allow. Shares no code with the
+/// search; whole seconds only.
 fn shortest_s(problem: &Problem) -> usize {
     const HORIZON: usize = 100;
     struct Trial<'a> {
@@ -189,7 +189,7 @@ fn shortest_s(problem: &Problem) -> usize {
     trial.best
 }
 
-/// Up to seven tasks that need units of two resources, or one machine of two.
+/// Up to seven tasks that need units of two resources, or one of two machines.
 fn small(seed: u64, machines: bool) -> Problem {
     let mut dice = Dice(seed);
     let size = 3 + dice.below(5);
@@ -215,7 +215,7 @@ fn the_plan_of_a_small_problem_is_the_shortest_there_is() {
         search.step(3_000);
         let advice = search.best();
         assert_eq!(advice.end_s, shortest_s, "seed {seed}, machines: {machines}");
-        // And a dispatch that is advised so comes to it.
+        // And a dispatch with this advice leads to that end.
         for (instance, seconds) in &advice.urgency_s {
             problem.tasks[instance.0 as usize].urgency_s = *seconds;
         }
@@ -229,7 +229,7 @@ fn the_plan_of_a_small_problem_is_the_shortest_there_is() {
 
 #[test]
 fn a_plan_that_needs_it_holds_somebody_back() {
-    // The first could have the machine at once, and the long way of the second begins with it a second later.
+    // The first task could have the machine at once, but the long chain of the second begins with it a second later.
     let tasks = vec![task(0, 5.0, "m", &[]), task(1, 1.0, "n", &[]), task(2, 1.0, "m", &[1]), task(3, 9.0, "n", &[2])];
     let mut search = Search::new(&problem(tasks, &[("m", 1), ("n", 1)]), 1).unwrap();
     search.step(100);
@@ -257,7 +257,7 @@ fn a_later_search_begins_where_the_one_before_ended() {
         search.step(600);
         let memory = search.memory();
         let mut later = Search::remembering(&problem, seed, &memory).unwrap();
-        // Two lists are the dispatch's own, the third is the best that is remembered; each makes three schedules.
+        // Two lists are the dispatch's own, the third is the best remembered one; each makes three schedules.
         later.step(9);
         assert!(later.best().end_s <= search.best().end_s, "seed {seed}, machines: {machines}");
     }

@@ -1,14 +1,14 @@
-//! New activity lists: drawn, crossed from two, and changed a little.
+//! New activity lists: random ones, children of two lists, and mutations.
 
 use super::dice::Dice;
 use super::project::Project;
 
-/// Of so many tasks that could come next in a drawn list the one with the longest remaining path does.
+/// A random list draws this many candidates for the next task and takes the one with the longest remaining path.
 const DRAWN: usize = 3;
-/// How likely a task changes places with the next (Hartmann, 1998).
+/// Probability that a task changes places with the next one (Hartmann, 1998).
 const MUTATION: f64 = 0.05;
 
-/// Which way a list is scheduled: from the beginning on, or from the end back.
+/// The direction in which a list is scheduled: from the beginning on, or from the end back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Direction {
     Forward,
@@ -23,7 +23,7 @@ impl Direction {
         }
     }
 
-    /// The tasks that come before a task in every list that is scheduled this way.
+    /// The predecessors of a task in this direction.
     fn before(self, project: &Project, task: u32) -> &[u32] {
         match self {
             Direction::Forward => project.before.of_place(task),
@@ -32,13 +32,13 @@ impl Direction {
     }
 }
 
-/// Makes lists; its memory is used again for the next.
+/// Makes lists; its memory is reused for the next one.
 #[derive(Debug, Clone)]
 pub(super) struct Variation {
     dice: Dice,
-    /// By task, whether the list has it already.
+    /// By task, whether the list already contains it.
     taken: Vec<bool>,
-    /// By task, of how many it comes behind that the list does not have yet.
+    /// By task, the number of its predecessors that are not in the list yet.
     open: Vec<u32>,
     eligible: Vec<u32>,
     order: Vec<u32>,
@@ -60,7 +60,7 @@ impl Variation {
         self.dice.below(bound)
     }
 
-    /// A list at random, of tasks with long remaining paths first; it is scheduled forward.
+    /// A random list for forward scheduling that prefers tasks with long remaining paths.
     pub(super) fn draw(&mut self, project: &Project, list: &mut Vec<u32>) {
         let Variation { dice, open, eligible, .. } = self;
         list.clear();
@@ -87,8 +87,8 @@ impl Variation {
         }
     }
 
-    /// A child of two lists that are scheduled in the direction: one keeps a piece of a quarter to three quarters of its length together and
-    /// in its place, and the other says in which order the rest is before and behind that.
+    /// Crossover of two lists for the same direction: the child keeps a piece of one list, a quarter to three quarters of its length, in
+    /// place; the other list gives the order of the remaining tasks.
     pub(super) fn cross(&mut self, project: &Project, direction: Direction, of: [&[u32]; 2], list: &mut Vec<u32>) {
         let tasks = project.len();
         let [mother, father] = if self.dice.below(2) == 0 { of } else { [of[1], of[0]] };
@@ -103,7 +103,7 @@ impl Variation {
         self.allow(project, direction, list);
     }
 
-    /// Some tasks change places with the next.
+    /// Swaps some tasks with their neighbours.
     pub(super) fn mutate(&mut self, project: &Project, direction: Direction, list: &mut [u32]) {
         for at in 1..list.len() {
             if self.dice.share() < MUTATION && !direction.before(project, list[at]).contains(&list[at - 1]) {
@@ -112,7 +112,7 @@ impl Variation {
         }
     }
 
-    /// The order as far as what waits for what allows: what a task comes behind goes right before it, if it is not there yet.
+    /// Repairs the order: missing predecessors are put right before a task.
     fn allow(&mut self, project: &Project, direction: Direction, list: &mut Vec<u32>) {
         list.clear();
         self.taken.fill(false);

@@ -1,4 +1,4 @@
-//! The outputs of other states, and the variables, that the expressions of a state use.
+//! Data flows: the outputs of other states, and the variables, that the expressions of a state use.
 
 use super::Subject;
 use ratn_model::expression::Expr;
@@ -12,7 +12,7 @@ use std::collections::BTreeSet;
 pub(super) fn start_flows(subject: &Subject<'_>) -> Vec<StateId> {
     let is_needed = |slot: Slot<'_>| match slot {
         Slot::Duration | Slot::Reads | Slot::Senses | Slot::Shared => false,
-        // What the effects of its parts are made of is needed to finish it, and it is one node.
+        // A node with parts needs the inputs of its parts' effects already, because it is one node.
         Slot::Effect(_) => subject.contains_others(),
         Slot::Resource(_, ResourceOperation::Create | ResourceOperation::Delete) => subject.contains_others(),
         _ => true,
@@ -25,7 +25,7 @@ pub(super) fn start_flows(subject: &Subject<'_>) -> Vec<StateId> {
             }
         });
     }
-    // What a state of a loop reads of itself is of the visit before.
+    // A loop's state that reads its own output means the visit before.
     if subject.contains_others() { without_inside(flows, subject) } else { flows.into_iter().collect() }
 }
 
@@ -41,13 +41,13 @@ pub(super) fn variables(subject: &Subject<'_>) -> Vec<String> {
     let mut names = BTreeSet::new();
     each_executed(subject, &mut |expression| names.extend(expression.variables().into_iter().map(str::to_owned)));
     if subject.is_routine() {
-        // A variable that it does not assign in the end is as it was before.
+        // A variable that the routine does not assign in the end keeps its earlier value.
         names.extend(assigns(subject));
     }
     names.into_iter().collect()
 }
 
-/// The variables to which a state assigns; of a routine, with what it contains, but for those that live inside of it.
+/// The variables to which a state assigns; of a routine, with what it contains, but without the variables declared inside of it.
 pub(super) fn assigns(subject: &Subject<'_>) -> BTreeSet<String> {
     let executed = subject.executed();
     let declared: BTreeSet<&String> =
@@ -57,7 +57,6 @@ pub(super) fn assigns(subject: &Subject<'_>) -> BTreeSet<String> {
     subject.state.assign.iter().map(|(name, _)| name).chain(inner).cloned().collect()
 }
 
-/// The states whose outputs the program reads anywhere.
 pub(super) fn read_anywhere(program: &Program) -> BTreeSet<StateId> {
     let all = program.states.iter().flat_map(|state| program.expressions(state));
     all.filter(|(slot, _)| *slot != Slot::Shared).flat_map(|(_, expression)| expression.flows()).collect()
@@ -70,7 +69,7 @@ fn each_executed<'a>(subject: &Subject<'a>, visit: &mut dyn FnMut(&'a Expr)) {
     }
 }
 
-/// What is written inside of a state is there when that runs. What the state itself has written is of its visit before, and comes from outside.
+/// Removes states inside: their outputs are written while the state runs. Its own output means the visit before and comes from outside.
 fn without_inside(mut flows: BTreeSet<StateId>, subject: &Subject<'_>) -> Vec<StateId> {
     let inside = subject.contained.iter().filter(|state| state.id != subject.state.id);
     inside.for_each(|state| {

@@ -16,7 +16,7 @@ pub(super) fn reads(subject: &Subject<'_>, requirements: &[ResourceExpr]) -> Opt
     for state in &subject.contained {
         match &state.annotations.reads {
             Some(reads) => all.extend(reads.iter().cloned()),
-            // A sensing node reads what it senses; any other action without the annotation reads everything.
+            // A sensing node reads what it senses; any other action without the annotation may read everything.
             None if is_action(state) && !matches!(state.annotations.nature, Nature::Senses(_)) => return None,
             None => {}
         }
@@ -24,7 +24,7 @@ pub(super) fn reads(subject: &Subject<'_>, requirements: &[ResourceExpr]) -> Opt
         for (slot, expression) in state.expressions() {
             let is_read = match slot {
                 Slot::Duration | Slot::Shared => false,
-                // The ends of the parts of one node lie within that node.
+                // The effects and resources of the parts are evaluated within the same node.
                 Slot::Effect(_) | Slot::Resource(..) => subject.contains_others(),
                 _ => true,
             };
@@ -37,8 +37,8 @@ pub(super) fn reads(subject: &Subject<'_>, requirements: &[ResourceExpr]) -> Opt
     let selectors = requirements.iter().flat_map(|r| r.expressions());
     all.extend(selectors.flat_map(|expression| expression.fact_expressions()).cloned());
     if subject.is_routine() {
-        // On a projection its parts change facts one after the other: those must be there as they are before. An ontology looks at
-        // others of the predicate, too.
+        // On a projection the parts change facts in turn, so the earlier values must be visible. An ontology also looks at other facts of the
+        // predicate.
         let whole = subject.program.ontology.is_some();
         for effect in subject.contained.iter().flat_map(|state| state.annotations.effects.values()).flatten() {
             let any = |fact: &FactExpr| FactExpr { arguments: vec![None; fact.arguments.len()], ..fact.clone() };
@@ -50,7 +50,7 @@ pub(super) fn reads(subject: &Subject<'_>, requirements: &[ResourceExpr]) -> Opt
     Some(all)
 }
 
-/// What is known inside of a routine only: seen from its place, it may be anything.
+/// States and variables inside of a routine: at the routine's own place their values are unknown.
 struct Inside {
     states: BTreeSet<StateId>,
     variables: BTreeSet<String>,
@@ -82,7 +82,7 @@ impl Inside {
         Inside { states: subject.contained.iter().map(|state| state.id).collect(), variables }
     }
 
-    /// Whether a value may be another one inside than at the place of the routine.
+    /// Whether a value may differ between the inside and the place of the routine.
     fn has(&self, expression: &Expr) -> bool {
         let mut has = false;
         expression.visit(&mut |part| {
@@ -96,7 +96,7 @@ impl Inside {
         has
     }
 
-    /// Arguments that are known inside only become `?`.
+    /// Replaces arguments that are known only inside by `?`.
     fn hide(&self, fact: &mut FactExpr) {
         for argument in &mut fact.arguments {
             if argument.as_ref().is_some_and(|argument| self.has(argument)) {
@@ -110,7 +110,7 @@ impl Inside {
             EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => self.hide(fact),
             EffectExpr::ForEach { collection, effects, .. } => {
                 if self.has(collection) {
-                    // No scope has it: the variable may be anything.
+                    // No scope has this output: the variable may have any value.
                     *collection = Expr::Output(String::new());
                 }
                 effects.iter_mut().for_each(|effect| self.hide_in(effect));
@@ -124,8 +124,8 @@ pub(super) fn senses(subject: &Subject<'_>) -> Vec<FactExpr> {
     subject.contained.iter().flat_map(|state| state.annotations.senses()).cloned().collect()
 }
 
-/// The facts by which a node is exact. An action forgives what is tolerated, and so does one inside of a routine; what it assigns is made of the
-/// facts as they came out, and of a routine that is all that it does itself. What the node requires is looked at when it becomes real.
+/// The facts for which a node tolerates no deviation. An action, also inside of a routine, ignores tolerated deviations of what it reads; its
+/// assignments are exact, and so is everything that a routine computes itself. The node's preconditions are checked when it retires.
 pub(super) fn exact(subject: &Subject<'_>) -> Vec<FactExpr> {
     let is_exact = |state: &State, slot: Slot<'_>| match slot {
         Slot::Assign(_) => true,
@@ -151,8 +151,8 @@ pub(super) fn effect_lookups(state: &State) -> Vec<FactExpr> {
     state.annotations.effects.values().flat_map(|effects| EffectExpr::fact_expressions(effects)).cloned().collect()
 }
 
-/// The effects of every outcome with which the nodes inside of a state may end while the state goes on or ends well. `None`: it may
-/// write every fact.
+/// The effects of every outcome with which the nodes inside of a state may end while the state goes on or ends well. `None`: it may write every
+/// fact.
 pub(super) fn may_write(subject: &Subject<'_>) -> Option<Vec<EffectExpr>> {
     let each = subject.contained.iter().map(|state| own_writes(subject, state));
     let mut all = each.collect::<Option<Vec<_>>>()?.concat();
@@ -178,7 +178,7 @@ fn own_writes(subject: &Subject<'_>, state: &State) -> Option<Vec<EffectExpr>> {
     Some(all)
 }
 
-/// Whether the whole ends by this outcome when a state inside of it does: no transition on the way handles it.
+/// Whether this outcome of an inner state ends the whole state: no transition on the way handles it.
 fn ends_all(subject: &Subject<'_>, state: &State, outcome: &str) -> bool {
     let outwards = std::iter::successors(Some(state), |inner| {
         inner.parent.filter(|_| inner.id != subject.state.id).map(|parent| subject.program.state(parent))
@@ -208,7 +208,7 @@ pub(super) fn writes(
     if writes.contains(&EVERYTHING) { BTreeSet::from([EVERYTHING]) } else { writes }
 }
 
-/// Under which keys a state writes with the outcomes that are computed ahead, and with each outcome.
+/// The keys that a state writes, over all outcomes that are computed ahead, and per outcome.
 pub(super) fn written(
     subject: &Subject<'_>,
     ends: &Ends,

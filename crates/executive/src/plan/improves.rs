@@ -1,11 +1,11 @@
-//! Which results may be improved after they were given: those of anytime actions, in the outputs that nobody uses before a motion begins.
+//! Which results an anytime action may go on to improve: those with outputs that nobody uses before a motion begins.
 //!
 //! ```text
-//! plan_approach ─ trajectory ─► in: { trajectory } of move_approach      free: looked at when that motion begins, and not before
-//!       └──────── end ────────► effects of move_approach, plan_transfer  kept: what is computed ahead is made of it
+//! plan_approach ─ trajectory ─► in: { trajectory } of move_approach      free: read when that motion begins, and not before
+//!       └──────── end ────────► effects of move_approach, plan_transfer  kept: computing ahead has used it
 //! ```
-//! So nothing is ever made again because of an improvement: what somebody may have used stays as it was at first. What senses may go on looking in
-//! the same way, until a motion begins that uses what it saw or changes what it looks at.
+//! So an improvement never invalidates anything: an output that may have been used stays as it was in the first result. A sensing action may
+//! likewise go on sensing, until a motion begins that uses its result or changes what it senses.
 
 use super::{NodeNature, Plan, is_action};
 use ratn_model::expression::Expr;
@@ -14,7 +14,7 @@ use ratn_model::program::{Program, State, StateKind};
 use ratn_model::slot::Slot;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Of every anytime action with an output that is used so, the outputs that have to stay as they were at first.
+/// The anytime actions that may improve, each with the outputs that must stay as in the first result.
 pub(super) fn of(program: &Program, plan: &Plan) -> BTreeMap<StateId, Box<[String]>> {
     let mut free: BTreeSet<(StateId, &str)> = BTreeSet::new();
     let mut kept: BTreeSet<(StateId, &str)> = BTreeSet::new();
@@ -28,7 +28,7 @@ pub(super) fn of(program: &Program, plan: &Plan) -> BTreeMap<StateId, Box<[Strin
             expression.visit(&mut |part| {
                 match part {
                     Expr::Port { state, port } => drop(ports.insert((*state, port))),
-                    // Its own, in what it assigns.
+                    // The state's own output, in what it assigns.
                     Expr::Output(port) => drop(ports.insert((state.id, port))),
                     _ => {}
                 }
@@ -40,7 +40,7 @@ pub(super) fn of(program: &Program, plan: &Plan) -> BTreeMap<StateId, Box<[Strin
         let own = plan.state(state.id);
         let can = state.annotations.anytime
             && own.nature != NodeNature::Irreversible
-            // What it changes, and measures, is said once, at its end.
+            // Effects and measurements are reported once, at the end.
             && own.may_write.as_ref().is_some_and(Vec::is_empty)
             && is_own_node(program, plan, state);
         let is_free = |port: &&String| {
@@ -57,11 +57,11 @@ pub(super) fn of(program: &Program, plan: &Plan) -> BTreeMap<StateId, Box<[Strin
 }
 
 enum Use {
-    /// It is only for people, or an estimate.
+    /// It is only shown to people, or it is an estimate.
     None,
-    /// When a motion begins: everything older is real then.
+    /// When a motion begins: everything older has retired then.
     AtItsBeginning,
-    /// Whenever it is known.
+    /// As soon as it is known.
     Ahead,
 }
 

@@ -3,16 +3,16 @@
 //! | file | what it finds out |
 //! |---|---|
 //! | [`nature`] | whether a node computes, senses or is irreversible |
-//! | [`resources`] | what it asks of the resource manager, and what it does to resources at its end |
+//! | [`resources`] | its requirements at the resource manager, and its resource operations at its end |
 //! | [`outcomes`] | where its outcomes lead, which of them are computed ahead, what each of them changes |
 //! | [`footprint`] | the facts that it reads, senses, looks up and may write |
 //! | [`written`] | under which keys it writes |
-//! | [`waits`] | what a wait may find otherwise than it was before |
+//! | [`waits`] | the shared facts that others may change while a state waits |
 //! | [`flows`] | the outputs and variables that its expressions use |
-//! | [`improves`] | whether its result may be improved after it was given, and what of it stays |
+//! | [`improves`] | whether its result may be improved later, and which outputs must not change |
 //!
-//! Hierarchies and routines are resolved here: a routine is one node, so its plan speaks of what it contains, too. Predicates and kinds of
-//! task resources are numbered ([`Predicate`]), so that tables of writers are indexed by small numbers.
+//! Hierarchies and routines are resolved here: a routine is one node, so its plan covers everything inside of it. Predicates and kinds of task
+//! resources are numbered ([`Predicate`]), so that tables of writers are indexed by small numbers.
 
 mod flows;
 mod footprint;
@@ -45,18 +45,18 @@ pub(crate) type Predicate = usize;
 pub(crate) struct Plan {
     states: Vec<StatePlan>,
     names: Names,
-    /// The facts by which regions may get at each other: those that are `shared`, and any where a region may change any.
+    /// The facts through which regions may affect each other: those that are `shared`, and all where a region may change any.
     pub(crate) crossing: Footprint,
-    /// How many predicates there are, [`EVERYTHING`] and the kinds of task resources included.
+    /// Number of predicates, including [`EVERYTHING`], [`WAITS`] and the kinds of task resources.
     pub(crate) width: usize,
-    /// How many buckets there are for the keys of facts: a power of two.
+    /// Number of buckets for the keys of facts: a power of two.
     buckets: usize,
 }
 
 /// The plan of one state.
 #[derive(Debug)]
 pub(crate) struct StatePlan {
-    /// What it does to the environment, with what it contains.
+    /// Its effect on the environment, including everything inside of it.
     pub(crate) nature: NodeNature,
     /// An action or a routine: executed as one node.
     pub(crate) is_node: bool,
@@ -64,16 +64,16 @@ pub(crate) struct StatePlan {
     pub(crate) is_routine: bool,
     /// A region of a concurrency.
     pub(crate) is_region: bool,
-    /// Younger PIAs may run beside it.
+    /// Imprecise exceptions: younger PIAs may run beside it.
     pub(crate) imprecise: bool,
     /// It waits, or something that it contains does.
     pub(crate) waits: bool,
-    /// What happens in the world may end it, or something inside of it: a wait, or a motion that is watched.
+    /// A change of the world may end it or a part of it: a wait, or a watched motion.
     pub(crate) is_watched: bool,
-    /// Of an action: its provider and its name there.
+    /// Of an action: the name of its provider and its own name.
     pub(crate) action: Option<(Arc<str>, Arc<str>)>,
 
-    /// `success`, the state's own, `aborted`, `preempted`.
+    /// Outcomes: `success`, the state's own, `aborted`, `preempted`.
     pub(crate) outcomes: Vec<Arc<str>>,
     /// Where each outcome leads.
     pub(crate) targets: Vec<Target>,
@@ -83,48 +83,47 @@ pub(crate) struct StatePlan {
     pub(crate) effects: Vec<Effects>,
     /// The predicates that the effects of each outcome write.
     pub(crate) effect_predicates: Vec<Vec<Predicate>>,
-    /// And under which keys; nothing where they may write every fact.
+    /// The keys written by each outcome's effects; nothing if they may write every fact.
     pub(crate) effects_written: Vec<Vec<Written>>,
-    /// The outcomes with which the exit of this composite state has something to do: effects, outputs, assignments, resources.
+    /// The outcomes with which the exit of this composite state has work to do: effects, outputs, assignments, resources.
     pub(crate) exits: Outcomes,
     /// States of its lists may be visited more than once in one activation.
     pub(crate) repeats: bool,
 
-    /// What it acquires when it starts: blocks (its own and those of the hierarchies around it and of what it contains, merged by
-    /// maximum), consumes and exists.
+    /// What it acquires when it starts: consumes, exists, and blocks (its own, and those of its parts and of the hierarchies around it, merged
+    /// by maximum).
     pub(crate) requirements: Vec<ResourceExpr>,
-    /// What an action works with, each selection once: a unit performs one goal at a time.
+    /// The resources that an action uses, each selector once: a unit performs one goal at a time.
     pub(crate) works_with: Vec<ResourceExpr>,
-    /// What it does to resources when it ends with success.
+    /// Its resource operations when it ends with success.
     pub(crate) operations: Vec<ResourceExpr>,
-    /// Whether something is used up when it gets what it acquires: that is not given back.
+    /// Whether its acquire consumes something, which is not given back.
     pub(crate) uses_up: bool,
     /// Whether it works on a projection of the world model.
     pub(crate) needs_world: bool,
-    /// The kinds of task resources that it depends on: those it blocks, consumes, creates, deletes or looks for.
+    /// The kinds of task resources on which it depends: those that it blocks, consumes, creates, deletes or requires to exist.
     pub(crate) kinds: Vec<Predicate>,
-    /// The kinds of task resources that it creates, deletes or consumes; of a node, with what it contains.
+    /// The kinds of task resources that it creates, deletes or consumes; of a node, including its parts.
     pub(crate) operated: Vec<Predicate>,
 
-    /// The facts that it reads, with those that its expressions look up, and those of the hierarchies around it and of what it
-    /// contains. `None`: it may read every fact.
+    /// The facts that it reads, including those that its expressions look up, and those of its parts and of the hierarchies around it. `None`:
+    /// it may read every fact.
     pub(crate) reads: Option<Vec<FactExpr>>,
-    /// The facts that it senses, with those of what it contains.
+    /// The facts that it senses, including its parts.
     pub(crate) senses: Vec<FactExpr>,
-    /// Of a node: the facts that its result says or is decided by, which it does not take as they were predicted where they came out otherwise,
-    /// be it within the tolerance.
+    /// Of a node: facts that its result states or depends on exactly. For these it is computed again even if a deviation from the prediction is
+    /// within the tolerance.
     pub(crate) exact: Vec<FactExpr>,
     /// The facts that its effects look up, whatever its outcome.
     pub(crate) effect_lookups: Vec<FactExpr>,
-    /// The effects that it may have, with those of what it contains, if it does not end by a failure that nothing handles. `None`:
-    /// it may write every fact.
+    /// The effects that it may have, including its parts, if it does not end by an unhandled failure. `None`: it may write every fact.
     pub(crate) may_write: Option<Vec<EffectExpr>>,
-    /// Of a node that waits: what may be otherwise when it has waited, by the doing of regions beside it.
+    /// Of a node that waits: the facts that regions beside it may change meanwhile.
     pub(crate) awaited: Effects,
     /// The predicates and kinds that it writes with an outcome that is computed ahead, and [`WAITS`]. If it may write every fact: [`EVERYTHING`]
     /// and the kinds.
     pub(crate) writes: Vec<Predicate>,
-    /// And under which keys; nothing if it may write every fact.
+    /// The keys that it writes; nothing if it may write every fact.
     pub(crate) written: Vec<Written>,
 
     /// The states whose outputs it needs before it starts; of a routine, those outside of it.
@@ -135,16 +134,15 @@ pub(crate) struct StatePlan {
     pub(crate) variables: Vec<String>,
     /// The variables to which it assigns; of a routine, with what it contains.
     pub(crate) assigns: Vec<String>,
-    /// Some state, or the task, reads its outputs.
+    /// Whether any state, or the task, reads its outputs.
     pub(crate) is_read: bool,
-    /// The states inside of it whose outputs are read: they are forgotten when it is entered.
+    /// The states inside of it whose outputs are read: these outputs are removed when it is entered.
     pub(crate) read_inside: Vec<StateId>,
-    /// Of an action whose result may be improved after it was given: the outputs that stay as they were at first.
+    /// Of an anytime action whose result may be improved later: the outputs that must stay as in the first result.
     pub(crate) improves: Option<Box<[String]>>,
 }
 
 impl Plan {
-    /// The plan of a checked program.
     pub(crate) fn of(program: &Program) -> Plan {
         let mut names = Names::default();
         let transitions = outcomes::Transitions::of(program);
@@ -167,22 +165,20 @@ impl Plan {
         plan
     }
 
-    /// The plan of one state.
     pub(crate) fn state(&self, id: StateId) -> &StatePlan {
         &self.states[index(id)]
     }
 
-    /// The number of a predicate; `None` if the program never writes it by name.
+    /// The number of a predicate; `None` if no effect of the program names it.
     pub(crate) fn predicate(&self, name: &str) -> Option<Predicate> {
         self.names.numbers.get(name).copied()
     }
 
-    /// All predicates and kinds.
     pub(crate) fn predicates(&self) -> impl Iterator<Item = Predicate> {
         0..self.width
     }
 
-    /// How many states there are.
+    /// Number of states.
     pub(crate) fn len(&self) -> usize {
         self.states.len()
     }
@@ -213,7 +209,7 @@ impl StatePlan {
         let resources = resources::of(subject, operated, names);
         writes.extend(&resources.operated);
         writes.extend(waits.then_some(WAITS));
-        // What is done on the way out of a state is done when all inside has ended, and the state is left when that is done.
+        // A `finally` begins when everything inside has ended, and the state is left after it.
         let around = state.parent.map(|parent| program.state(parent));
         let lastly = around.and_then(|around| around.annotations.finally.as_ref());
         let is_before_finally = lastly.is_some_and(|finally| finally.body == state.id);
@@ -272,7 +268,7 @@ impl StatePlan {
         }
     }
 
-    /// Whether no fact is anything to it: its state says so, and none of its expressions looks one up.
+    /// Whether it depends on no fact: its annotations say so, and its expressions look up none.
     pub(crate) fn reads_nothing(&self) -> bool {
         self.reads.as_ref().is_some_and(Vec::is_empty)
     }
@@ -283,12 +279,12 @@ impl StatePlan {
     }
 }
 
-/// The state that a plan is made of, with its place in the tree.
+/// The state whose plan is made, with its place in the tree.
 struct Subject<'a> {
     program: &'a Program,
     state: &'a State,
     is_node: bool,
-    /// The state and all that it contains, in the order of the program.
+    /// The state and everything inside of it, in program order.
     contained: Vec<&'a State>,
     /// The states around it, innermost first.
     around: Vec<&'a State>,
@@ -316,13 +312,13 @@ impl<'a> Subject<'a> {
         self.contained.len() > 1
     }
 
-    /// The states that are executed when it is: of a node all that it contains, of any other state itself alone.
+    /// The states that execute together: of a node everything inside of it, of any other state itself alone.
     fn executed(&self) -> &[&'a State] {
         if self.is_node { &self.contained } else { std::slice::from_ref(&self.state) }
     }
 }
 
-/// The numbers of predicates and kinds, given as they are met. 0 is [`EVERYTHING`], 1 is [`WAITS`].
+/// Gives numbers to predicates and kinds in the order in which they are met. 0 is [`EVERYTHING`], 1 is [`WAITS`].
 #[derive(Debug, Default)]
 struct Names {
     numbers: BTreeMap<String, Predicate>,
@@ -338,7 +334,7 @@ impl Names {
         next
     }
 
-    /// The task resources of a kind stand among the predicates under a name that no predicate has.
+    /// The number of the task resources of a kind, under a name that no predicate can have.
     fn of_kind(&mut self, kind: &str) -> Predicate {
         self.of_predicate(&format!("#{kind}"))
     }

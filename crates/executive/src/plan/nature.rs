@@ -5,7 +5,7 @@ use super::resources::operated;
 use ratn_model::program::{Nature, State, StateKind};
 use serde::{Deserialize, Serialize};
 
-/// What a node does to the environment. A routine computes if all that it contains computes, else it is irreversible.
+/// A node's effect on the environment. A routine computes if all its parts compute, else it is irreversible.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub(crate) enum NodeNature {
     /// Works on a projection.
@@ -18,13 +18,13 @@ pub(crate) enum NodeNature {
 
 pub(super) fn of(subject: &Subject<'_>) -> NodeNature {
     match subject.contained.iter().map(|state| own(state)).max() {
-        // What it senses may depend on what it has just changed: it runs at its place in the program.
+        // It may sense what it has just changed, so it runs at its place in the program.
         Some(NodeNature::Senses) if subject.contains_others() => NodeNature::Irreversible,
         nature => nature.unwrap_or(NodeNature::Computes),
     }
 }
 
-/// The nature of a state without what it contains.
+/// The nature of a state without its parts.
 pub(super) fn own(state: &State) -> NodeNature {
     if operated(state).next().is_some() {
         return NodeNature::Irreversible;

@@ -1,4 +1,4 @@
-//! Outcomes of a state: where each leads, which of them are computed ahead, and what each of them changes.
+//! Outcomes of a state: where each leads, which are computed ahead, and the effects of each.
 
 use super::nature::NodeNature;
 use super::{Names, Predicate, Subject, index};
@@ -9,47 +9,47 @@ use ratn_model::program::{Program, ResourceExpr, SUCCESS, State, Target, is_fail
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Writers that may write every fact stand under this number.
+/// The number of writers that may write every fact.
 pub(crate) const EVERYTHING: Predicate = 0;
 
-/// An outcome of a state: its place in [`super::StatePlan::outcomes`].
+/// An outcome of a state: its index in [`super::StatePlan::outcomes`].
 pub(crate) type Outcome = usize;
 
 /// The outcome `success`, which every state has.
 pub(crate) const SUCCEEDED: Outcome = 0;
 
-/// A set of outcomes by bits; a state has at most [`MAX_OUTCOMES`].
+/// A set of outcomes as bits; it holds the first [`MAX_OUTCOMES`].
 pub(crate) type Outcomes = u64;
 
-/// More outcomes than this are exceptional, whatever they lead to.
+/// Outcomes beyond this number are exceptional, whatever they lead to.
 pub(crate) const MAX_OUTCOMES: usize = 64;
 
-/// Outcomes that lead to the same place and agree on whether there are outputs.
+/// Outcomes with the same target that agree on whether there are outputs.
 #[derive(Debug, Clone)]
 pub(crate) struct ArmPlan {
     /// All of them.
     pub(crate) outcomes: Outcomes,
-    /// One of them, for looking up target and name.
+    /// One of them, to look up target and name.
     pub(crate) outcome: Outcome,
-    /// All of them change the same; else the changes are known only when the node has ended.
+    /// Whether all have the same effects; if not, the changes are known only when the node has ended.
     pub(crate) same_effects: bool,
 }
 
-/// What an outcome changes.
+/// The effects of an outcome.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Effects {
-    /// Any fact; known when the node has ended.
+    /// Any fact may change; known when the node has ended.
     Unknown,
-    /// These.
+    /// The declared effects.
     Declared(Vec<EffectExpr>),
 }
 
-/// Whether a state that ends so has outputs and assigns.
+/// Whether a state with this outcome has outputs and assigns variables.
 pub(crate) fn gives_outputs(outcome: &str) -> bool {
     !is_failure(outcome)
 }
 
-/// The outcomes of all states, and where those lead that are not connected.
+/// The outcomes of all states, and the targets of outcomes without a transition.
 pub(super) struct Transitions {
     outcomes: Vec<Vec<String>>,
     next: Vec<Option<StateId>>,
@@ -71,7 +71,7 @@ impl Transitions {
         Transitions { outcomes: program.all_outcomes(), next, repeats }
     }
 
-    /// Whether states of the lists of a state may be visited more than once in one activation.
+    /// Whether states of its lists may be visited more than once in one activation.
     pub(super) fn repeats(&self, id: StateId) -> bool {
         self.repeats[index(id)]
     }
@@ -85,7 +85,7 @@ impl Transitions {
     }
 }
 
-/// Whether a transition leads from a state of a list to itself or to a state before it.
+/// Whether a transition leads from a state of a list to itself or to an earlier state.
 fn leads_back(program: &Program, list: &[StateId]) -> bool {
     let position: BTreeMap<StateId, usize> = list.iter().enumerate().map(|(place, id)| (*id, place)).collect();
     list.iter().any(|id| {
@@ -96,7 +96,7 @@ fn leads_back(program: &Program, list: &[StateId]) -> bool {
     })
 }
 
-/// How one state may end; everything by outcome.
+/// The possible ends of one state; every field is by outcome.
 pub(super) struct Ends {
     pub(super) names: Vec<Arc<str>>,
     pub(super) targets: Vec<Target>,
@@ -125,8 +125,7 @@ pub(super) fn of(
     }
 }
 
-/// What an outcome changes. A routine has changed what the nodes inside of it have changed; when a wait is over, what others have done
-/// meanwhile is otherwise, too.
+/// The effects of an outcome: of a routine, the unknown ones of its nodes; after a wait, also what others may have changed meanwhile.
 fn changes(subject: &Subject<'_>, nature: NodeNature, awaited: &Effects, outcome: &str) -> Effects {
     let state = subject.state;
     let declared = if subject.is_routine() {
@@ -170,7 +169,6 @@ fn arms(state: &State, outcomes: &[String], targets: &[Target], effects: &[Effec
     arms
 }
 
-/// The predicates that effects write.
 fn predicates(effects: &Effects, names: &mut Names) -> BTreeSet<Predicate> {
     match effects {
         Effects::Unknown => BTreeSet::from([EVERYTHING]),
@@ -180,13 +178,12 @@ fn predicates(effects: &Effects, names: &mut Names) -> BTreeSet<Predicate> {
     }
 }
 
-/// All outcomes of a state.
 pub(super) fn every(ends: &Ends) -> Outcomes {
     let known = ends.names.iter().take(MAX_OUTCOMES).enumerate();
     known.fold(0, |all, (number, _)| all | 1 << number)
 }
 
-/// The outcomes with which the exit of a composite state has something to do.
+/// The outcomes with which the exit of a composite state has work to do.
 pub(super) fn exits(state: &State, ends: &Ends, operations: &[ResourceExpr]) -> Outcomes {
     let gives = !state.outputs().is_empty() || !state.assign.is_empty();
     let mut exits = 0;

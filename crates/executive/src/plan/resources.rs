@@ -33,7 +33,8 @@ pub(super) fn of(subject: &Subject<'_>, operated_anywhere: &BTreeSet<&str>, name
     Resources { kinds: kinds.into_iter().collect(), operated: numbers, requirements, works_with, operations }
 }
 
-/// What an action blocks itself, else what the innermost state around it blocks that blocks anything. Many look at a world model at once.
+/// What an action blocks itself, else what the innermost state around it that blocks anything blocks. World models are left out: many goals may
+/// read one.
 fn works_with(subject: &Subject<'_>) -> Vec<ResourceExpr> {
     if !is_action(subject.state) || subject.state.is_pause() {
         return Vec::new();
@@ -50,34 +51,34 @@ fn works_with(subject: &Subject<'_>) -> Vec<ResourceExpr> {
     states.map(blocks).find(|blocked| !blocked.is_empty()).unwrap_or_default()
 }
 
-/// The kinds of resources that a state, without what it contains, changes rather than holds.
+/// The kinds of resources that a state itself, without its parts, creates, deletes or consumes.
 pub(super) fn operated(state: &State) -> impl Iterator<Item = &str> {
     let changes = |r: &&ResourceExpr| !matches!(r.operation, ResourceOperation::Block | ResourceOperation::Exists);
     state.annotations.resources.iter().filter(changes).map(|r| r.kind.as_str())
 }
 
-/// The kinds of resources that any state changes.
+/// The kinds of resources that any state creates, deletes or consumes.
 pub(super) fn operated_anywhere(program: &Program) -> BTreeSet<&str> {
     program.states.iter().flat_map(operated).collect()
 }
 
-/// Whether it is in a routine that works on the world as it is: what computes there does so at its place in the program, and looks at the root.
-/// Room for a projection that its `reads` alone ask for is none that the routine would hold until its end, over all that it waits for.
+/// Whether a state is in a routine that works on the actual world: a computing node there runs at its place in the program and reads the root.
+/// So the room for a projection that only its `reads` imply is not needed; the routine would hold it to its end, through all its waits.
 fn looks_at_root(subject: &Subject<'_>) -> bool {
     let acts = |routine: &State| nature::of(&Subject::of(subject.program, routine)) != NodeNature::Computes;
     let states = std::iter::once(subject.state).chain(subject.around.iter().copied());
     states.filter(|state| state.is_routine()).any(acts)
 }
 
-/// Whether a state blocks this because of its `reads`, and nobody says so.
+/// Whether a block is implied by the state's `reads` and not written in the task.
 fn is_implied(state: &State, line: &ResourceExpr) -> bool {
     line.kind == WORLD_MODEL && state.annotations.origin.get(WORLD_MODEL) == Some(&Origin::Reads)
 }
 
-/// Blocks of one state add up, those of states inside of each other merge by maximum. What an action consumes and what has to
-/// exist add up as they are, but only from the state itself and what it contains.
+/// Blocks of one state add up; blocks of nested states merge by maximum. Consumes and exists add up as they are, but only from the state itself
+/// and its parts.
 fn requirements(subject: &Subject<'_>) -> Vec<ResourceExpr> {
-    // Nothing is held while time passes, whatever is blocked around.
+    // A wait holds nothing while time passes, whatever the states around it block.
     if subject.state.is_pause() {
         return Vec::new();
     }
@@ -109,7 +110,7 @@ fn merge(into: &mut Vec<ResourceExpr>, wanted: &ResourceExpr, counts: impl FnOnc
     }
 }
 
-/// What is done at the end. A composite state consumes at its exit; an action has consumed when it acquired.
+/// Operations at the end of a state. A composite state consumes at its exit; an action has consumed at its acquire.
 fn operations(state: &State) -> Vec<ResourceExpr> {
     let at_end = |r: &&ResourceExpr| match r.operation {
         ResourceOperation::Create | ResourceOperation::Delete => true,

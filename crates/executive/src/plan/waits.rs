@@ -1,5 +1,5 @@
-//! What a wait may find otherwise when it is over. It changes nothing itself; but it lets time pass, in which the regions beside it go on:
-//! what they write of the facts that are `shared` is not what it was before, and nobody computes on what that was.
+//! What others may change while a state waits. A wait changes nothing itself, but time passes, and the regions beside it go on. So the
+//! `shared` facts that they write are unknown until the wait is over, and nothing is computed from their earlier values.
 
 use super::{Effects, Predicate, Subject, footprint};
 use ratn_model::expression::scope::NothingKnown;
@@ -8,11 +8,11 @@ use ratn_model::fact::{FactPattern, Footprint, Term};
 use ratn_model::program::{Program, State, StateKind};
 use ratn_model::value::Value;
 
-/// States that wait, and routines that contain some, stand under this number: who senses looks when they have waited.
+/// The number of states that wait and of routines with waits inside: sensing nodes behind them run after the wait.
 pub(crate) const WAITS: Predicate = 1;
 
-/// The shared facts that regions beside a state that waits may write, with values that are not known before it has waited; any fact where
-/// such a region may write any.
+/// The shared facts that regions beside a waiting state may write, with unknown values; `Unknown` if such a region may write
+/// any fact.
 pub(super) fn awaited(subject: &Subject<'_>) -> Effects {
     if !subject.is_node || !subject.contained.iter().any(|state| state.is_pause()) {
         return Effects::Declared(Vec::new());
@@ -30,7 +30,7 @@ pub(super) fn awaited(subject: &Subject<'_>) -> Effects {
                 let beside = within(program, program.state(*beside));
                 let annotated = own.iter().chain(&beside).flat_map(|state| &state.annotations.shared);
                 let shared = FactExpr::footprint(&annotated.cloned().collect::<Vec<_>>(), &NothingKnown);
-                // What a wait foresees somebody else does.
+                // The effects that a wait foresees are made by somebody else.
                 let effects =
                     beside.iter().filter(|state| !state.is_pause()).flat_map(|s| s.annotations.effects.values());
                 let written = EffectExpr::footprint(&effects.flatten().cloned().collect::<Vec<_>>(), &NothingKnown);
@@ -44,7 +44,7 @@ pub(super) fn awaited(subject: &Subject<'_>) -> Effects {
     Effects::Declared(facts.into_iter().map(unknown).collect())
 }
 
-/// A state and all that it contains.
+/// A state and everything inside of it.
 fn within<'p>(program: &'p Program, state: &'p State) -> Vec<&'p State> {
     let mut all = vec![state];
     let mut next = 0;
@@ -55,11 +55,11 @@ fn within<'p>(program: &'p Program, state: &'p State) -> Vec<&'p State> {
     all
 }
 
-/// The patterns of one that overlap with some of the other, the narrower ones of both.
+/// The overlaps of the patterns of both footprints: of each overlapping pair the narrower pattern.
 fn both<'f>(shared: &'f Footprint, written: &'f Footprint) -> impl Iterator<Item = FactPattern> + 'f {
     let patterns = |footprint: &'f Footprint| match footprint {
         Footprint::Patterns(patterns) => patterns.as_slice(),
-        // Annotations name their facts.
+        // Does not occur: annotations name their facts.
         Footprint::Everything => &[],
     };
     patterns(written).iter().flat_map(move |written| {
@@ -68,7 +68,7 @@ fn both<'f>(shared: &'f Footprint, written: &'f Footprint) -> impl Iterator<Item
     })
 }
 
-/// An effect on the facts of a pattern whose value nothing gives.
+/// An effect with unknown value on the facts of a pattern.
 fn unknown(pattern: FactPattern) -> EffectExpr {
     let term = |term: Term| match term {
         Term::Int(number) => Value::Int(number),

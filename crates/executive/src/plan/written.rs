@@ -1,30 +1,30 @@
-//! Under which keys a state writes: the index of memory renaming.
+//! The keys that a state writes: the index of memory renaming.
 //!
-//! Most effects say the key of the fact that they write by literals and loop variables: it is known where the state is expanded, and
-//! never changes. Then the writer stands in the chain of that key, and who looks at another key of the predicate never meets it.
-//! A writer whose keys are not known there stands in the chain of the whole predicate.
+//! Most effects name the key of their fact by literals and loop variables, so the key is known when the state is expanded, and never
+//! changes. Such a writer is in the chain of that key, and a reader of another key never meets it. Writers whose keys are not known
+//! then are in one chain of their predicate, which every reader of the predicate visits.
 
 use super::{Names, Plan, Predicate};
 use ratn_model::expression::{EffectExpr, FactExpr, Scope};
 use ratn_model::fact::{FactPattern, Term};
 
-/// A chain of writers, as an index into tables of writers: of a predicate, of the writers of a predicate whose keys are not known, or
-/// of keys that share a bucket.
+/// A chain of writers, as an index into tables of writers: all writers of a predicate, the writers of a predicate with unknown keys,
+/// or the writers of keys that share a bucket.
 pub(crate) type Chain = usize;
 
-/// No program has more buckets for keys, and none fewer.
+/// Limits of the number of buckets for keys.
 const MOST_BUCKETS: usize = 1 << 16;
 const FEWEST_BUCKETS: usize = 64;
 
-/// What a state writes of one predicate.
+/// The keys that a state writes of one predicate.
 #[derive(Debug)]
 pub(crate) struct Written {
     pub(crate) predicate: Predicate,
-    /// The facts, if each stands alone in an effect: not in a quantifier, and without `?`.
+    /// The facts, if each is named by an effect of its own: not in a quantifier, and without `?`.
     facts: Option<Vec<FactExpr>>,
 }
 
-/// What effects write, by predicate.
+/// The keys that effects write, by predicate.
 pub(super) fn written<'e>(effects: impl IntoIterator<Item = &'e EffectExpr>, names: &mut Names) -> Vec<Written> {
     let mut all: Vec<Written> = Vec::new();
     let mut add = |fact: &FactExpr, is_alone: bool, names: &mut Names| {
@@ -51,12 +51,11 @@ pub(super) fn written<'e>(effects: impl IntoIterator<Item = &'e EffectExpr>, nam
 }
 
 impl Plan {
-    /// How many buckets there are for keys in a window of a horizon.
+    /// Number of buckets for keys in a window with this horizon.
     pub(super) fn buckets(horizon: usize) -> usize {
         horizon.next_power_of_two().clamp(FEWEST_BUCKETS, MOST_BUCKETS)
     }
 
-    /// How many chains there are.
     pub(crate) fn chains(&self) -> usize {
         2 * self.width + self.buckets
     }
@@ -66,7 +65,7 @@ impl Plan {
         predicate
     }
 
-    /// The chains in which the writers of a pattern stand; none if nothing writes its predicate.
+    /// The chains with the possible writers of a pattern; none if nothing writes its predicate.
     pub(crate) fn chains_of(&self, pattern: &FactPattern) -> [Option<Chain>; 2] {
         let Some(predicate) = self.predicate(&pattern.predicate) else { return [None; 2] };
         match self.bucket(predicate, pattern) {
@@ -75,7 +74,7 @@ impl Plan {
         }
     }
 
-    /// The chains in which a writer stands for a predicate, beside that of all its writers; `scope` knows what is known where it is
+    /// The chains that a writer joins for a predicate, besides that of all its writers; `scope` has what is known when the writer is
     /// expanded.
     pub(crate) fn chains_written(&self, written: &Written, scope: &dyn Scope, into: &mut dyn FnMut(Chain)) {
         let buckets = written.facts.as_ref().and_then(|facts| {
@@ -100,7 +99,7 @@ impl Plan {
                 Term::Name(name) => name.bytes().chain([0xff]).for_each(&mut add),
             }
         }
-        // The low bits of the product depend on the low bits of what was added only.
+        // Mixing is needed: the low bits of a product depend only on the low bits of its factors.
         let mixed = hash ^ (hash >> 32);
         Some(2 * self.width + (mixed as usize & (self.buckets - 1)))
     }

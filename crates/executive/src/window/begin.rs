@@ -1,4 +1,4 @@
-//! Beginning a node: its resources, its projection, its goal.
+//! Beginning a node: acquire its resources, make its projection, start its goal.
 
 use super::Window;
 use super::graph::instance::{Ended, Instance, Status};
@@ -22,13 +22,13 @@ use ratn_model::resource::{Requirement, ResourceOperation};
 use std::sync::Arc;
 
 impl Window {
-    /// Looks at a node that has not begun.
+    /// Begins a node, or notes what it waits for.
     pub(super) fn begin(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.follow_root(context);
         let looked = self.look(context, id, None, |instance, view| {
             let mut seen = Seen::default();
             let readiness = self.readiness(context, instance, view, &mut seen);
-            // What made it fail may come out otherwise, too, and so may what a sensing node waits to see; a PIA's inputs are final.
+            // A failure, and what a sensing node waits to see, may change too, so their inputs are registered. A PIA's inputs are final.
             let is_made = match readiness {
                 Readiness::Ready(..) | Readiness::Failed(_) => true,
                 Readiness::Waits(wait) => matches!(wait, Wait::Environment(_) | Wait::Order),
@@ -60,7 +60,7 @@ impl Window {
         }
     }
 
-    /// Whether the operator lets a node not begin; where it stands at a breakpoint, nothing else begins from now on.
+    /// Whether the operator does not let a node begin. If it stands at a breakpoint, the run pauses from now on.
     pub(super) fn is_held_back(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
         let Some(instance) = self.graph.get(id).filter(|instance| instance.is_pia()) else { return false };
         let state = instance.state;
@@ -73,8 +73,8 @@ impl Window {
         true
     }
 
-    /// It has its resources. Where the operator lets it not begin it gives them back, for others may want them meanwhile, and asks anew when it may;
-    /// what it has used up by that it keeps.
+    /// The node has its resources. If the operator does not let it begin, it gives them back, because others may want them meanwhile, and asks again
+    /// later. If it has consumed any, it keeps its lease.
     pub(super) fn proceed_unless_held_back(&mut self, context: &mut Context<'_>, id: InstanceId) {
         if self.is_held_back(context, id) {
             let uses_up = self.graph.get(id).is_some_and(|instance| context.plan.state(instance.state).uses_up);
@@ -83,14 +83,14 @@ impl Window {
         self.proceed(context, id);
     }
 
-    /// It never began and never will, or not once more.
+    /// Ends a node `aborted` that has not begun, or may not begin again.
     pub(super) fn fail(&mut self, context: &mut Context<'_>, id: InstanceId, reason: String) {
         context.note(Note::Finished { instance: id, outcome: ABORTED.into() });
         let outputs = self.unassigned(context, id);
         self.end_node(context, id, Ended { outputs, ..Ended::aborted(reason) });
     }
 
-    /// A routine that did not run leaves the variables that it would assign as they were.
+    /// The outputs of a node that did not run: a routine keeps the variables that it would assign.
     pub(super) fn unassigned(&self, context: &Context<'_>, id: InstanceId) -> Outputs {
         let outputs = self.look(context, id, None, |instance, view| {
             let own = context.plan.state(instance.state);
@@ -113,7 +113,7 @@ impl Window {
         let is_like_before = is_pia || instance.seen().is_some_and(|before| before.is_like(&seen));
         self.graph.set_seen(id, (!is_pia).then_some(seen));
         if !is_like_before {
-            // What failed before was made of something else: its tries begin again.
+            // Earlier failures had other inputs: the tries begin again at 1.
             self.graph.forget_tries(id);
         }
         if self.reuse(context, id) {
@@ -141,7 +141,7 @@ impl Window {
         context.commands.push(Command::Acquire { instance: id, requirements, priority });
     }
 
-    /// Takes over a result that is there, or waits for the one that is being computed; whether it did.
+    /// Takes the result from the cache, or waits for the instance that computes the same; true if either applies.
     fn reuse(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
         let Some(instance) = self.graph.get(id) else { return false };
         let speculative = self.graph.is_speculative(instance.segment);
@@ -152,7 +152,7 @@ impl Window {
         let Some(seen) = instance.seen() else { return false };
         match self.results.find(&self.graph, id, seed, seen) {
             Some(Known::Result(mut ended)) => {
-                // What it assigns may be made of what differs between the branches.
+                // Assigned values may depend on facts that differ between the branches.
                 ended.outputs.retain(|port, _| !port.starts_with(super::growth::environment::ASSIGNED));
                 if let Err(problem) = self.assign(context, id, &mut ended) {
                     *ended = Ended { changes: ended.changes.clone(), ..Ended::aborted(problem) };
@@ -168,7 +168,7 @@ impl Window {
             }
             None => {
                 if speculative && self.results.note_twin(id, seed) {
-                    // Its next try: whoever waits for what it computed before does that itself.
+                    // Next try: an instance that waits for the earlier try has to compute that itself.
                     self.waits.wake(&mut self.graph, id);
                 }
                 false
@@ -176,11 +176,11 @@ impl Window {
         }
     }
 
-    /// A result that is about to be discarded is kept.
+    /// Keeps a result in the cache before it is discarded.
     pub(super) fn keep_result(&mut self, context: &Context<'_>, id: InstanceId) {
         let Some(instance) = self.graph.get(id) else { return };
         let (Some(seen), Some(ended)) = (instance.seen(), instance.ended()) else { return };
-        // A failure to begin is no result.
+        // A node that failed to begin has no result.
         let is_none = !ended.reason.is_empty() && ended.outputs.is_empty();
         if !is_cacheable(context, instance) || self.is_ending || is_none {
             return;
@@ -190,7 +190,7 @@ impl Window {
         self.wake_twins(id);
     }
 
-    /// What a visit's random choices are derived from.
+    /// The random seed of a visit.
     fn seed(&self, context: &Context<'_>, instance: &Instance) -> u64 {
         let state = context.program.state(instance.state);
         let mut seed = Seed::of(context.seed);
@@ -218,14 +218,14 @@ impl Window {
         }
     }
 
-    /// It gives back what it has and begins again later.
+    /// Gives back what the node holds; it begins again later.
     pub(super) fn step_back(&mut self, context: &mut Context<'_>, id: InstanceId, wait: Wait) {
         self.stop_node(context, id);
         self.graph.begin_again(id);
         self.wait(id, wait);
     }
 
-    /// An answer of the resource manager or of the world pool.
+    /// Handles an answer of the resource manager or of the world pool.
     pub(super) fn answered(&mut self, context: &mut Context<'_>, event: Event) {
         match event {
             Event::Granted { instance: id, lease } => {
@@ -258,7 +258,7 @@ impl Window {
         }
     }
 
-    /// What a node uses up is gone when it gets it.
+    /// Accounts for the resources that a node consumes with its grant.
     fn used_up(&mut self, context: &Context<'_>, id: InstanceId) {
         let Some(instance) = self.graph.get(id).filter(|instance| context.plan.state(instance.state).uses_up) else {
             return;
@@ -277,8 +277,8 @@ impl Window {
         self.graph.node(id).map(|node| &node.status)
     }
 
-    /// It has its resources. While it waited for them the world at its place may have changed, within tolerances or where nobody
-    /// could know that it looks there: it looks again.
+    /// The node has its resources. Meanwhile the world at its place may have changed, within tolerances or before the node was registered as a
+    /// reader, so it reads again.
     pub(super) fn proceed(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.follow_root(context);
         let Some(nature) = self.graph.node(id).map(|node| node.nature) else { return };
@@ -298,7 +298,7 @@ impl Window {
                     seen.inputs = before.inputs;
                     if !before.saw_the_same(&seen) {
                         self.graph.forget_tries(id);
-                        // It computes something else than whoever waits for it wants.
+                        // It computes something else than the instances that wait for its result.
                         self.waits.wake(&mut self.graph, id);
                     }
                     self.graph.set_seen(id, Some(seen));
@@ -308,9 +308,9 @@ impl Window {
         self.launch(context, id, None);
     }
 
-    /// What it reads is as it was when it asked: it gets its projection, then its goal starts.
+    /// The node's inputs are up to date: makes its projection, then starts its goal.
     fn launch(&mut self, context: &mut Context<'_>, id: InstanceId, known: Option<Outputs>) {
-        // What ends before it begins is no step of the operator's.
+        // A node that ends before it begins does not count as an operator's step.
         if self.is_not_met(context, id) || self.ends_violated(context, id) {
             return;
         }
@@ -331,8 +331,8 @@ impl Window {
         self.start_goal(context, id, known);
     }
 
-    /// Ends a PIA of which a precondition does not hold any more: while it waited for its resources somebody else has changed the world.
-    /// Whether it did.
+    /// Ends a PIA with a precondition that no longer holds, because somebody else changed the world while it waited for its resources. True if it
+    /// ended.
     fn is_not_met(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
         let Some(instance) = self.graph.get(id).filter(|instance| instance.is_pia()) else { return false };
         let state = context.program.state(instance.state);
@@ -431,7 +431,7 @@ impl Window {
         context.commands.push(Command::Start { instance: id, attempt, goal: Box::new(goal) });
     }
 
-    /// Each change with the path of who makes it.
+    /// All changes in order, each with the path of its writer.
     fn named(&self, context: &Context<'_>, by_writer: Vec<(InstanceId, Vec<Change>)>) -> (Vec<Arc<str>>, Vec<Change>) {
         let mut writers = Vec::new();
         let mut all = Vec::new();
@@ -497,13 +497,13 @@ impl Window {
         self.routine_progressed(context, id, progress);
     }
 
-    /// Who waits for the resource manager asks again if its priority has changed.
+    /// Instances that wait for the resource manager ask again if their priority has changed.
     pub(super) fn ask_again(&mut self, context: &mut Context<'_>) {
         for id in self.dispatch.misplaced(&self.graph) {
             let Some(instance) = self.graph.get(id) else { continue };
             let wanted = &context.plan.state(instance.state).requirements;
             if wanted.iter().any(|r| r.operation == ResourceOperation::Consume) {
-                // A grant that crosses the withdrawal has used it up already: asking twice would use it up twice.
+                // A grant that crosses the withdrawal may have consumed already; asking again would consume twice.
                 continue;
             }
             let priority = self.dispatch.priority(&self.graph, instance);
@@ -519,7 +519,7 @@ impl Window {
         }
     }
 
-    /// A look-ahead advises who is to be held back: what was advised before is over.
+    /// Applies the holds of new advice; they replace all earlier ones.
     pub(super) fn hold_back(&mut self, context: &mut Context<'_>, held: &[Held]) {
         let (before, holds) = self.dispatch.hold(&self.graph, context.now, held);
         for (id, until) in holds {
@@ -528,7 +528,7 @@ impl Window {
             let Some(instance) = self.graph.get(id) else { continue };
             let wanted = &context.plan.state(instance.state).requirements;
             let is_asking = instance.node().is_some_and(|node| matches!(node.status, Status::Acquiring { .. }));
-            // As when it asks again: what a crossing grant has used up stays used up.
+            // As in `ask_again`: a crossing grant may have consumed already.
             let uses_up = wanted.iter().any(|r| r.operation == ResourceOperation::Consume);
             if is_asking && !uses_up && self.dispatch.is_held(&self.graph, id) {
                 self.step_back(context, id, Wait::Turn);
@@ -539,7 +539,7 @@ impl Window {
         }
     }
 
-    /// Speculative holders give way to certain nodes, and whoever waits for room begins where there is some; whether anybody did.
+    /// Speculative holders give way to certain nodes, and instances that wait for room begin where there is some; true if any did.
     pub(super) fn give_way(&mut self, context: &mut Context<'_>) -> bool {
         let in_the_way = self.dispatch.in_the_way(&self.graph, context.plan);
         let mut first = self.dispatch.take_stalled(&self.graph);
@@ -556,8 +556,8 @@ impl Window {
 }
 
 impl Window {
-    /// Another run needs for certain what one of these holds: whoever only improves a result gives way, else the least urgent of those that
-    /// are speculative, if any is.
+    /// Another run certainly needs something that one of these instances holds. An instance that only improves its result gives way, else the least
+    /// urgent speculative one, if there is one.
     pub(super) fn give_way_to_others(&mut self, context: &mut Context<'_>, holders: &[InstanceId]) {
         if let Some(improving) = holders.iter().find(|id| self.improving.has(**id)) {
             return self.harvest(context, *improving);
@@ -572,7 +572,7 @@ impl Window {
         }
     }
 
-    /// A speculative holder gives back what it has and asks again.
+    /// A speculative holder gives back its resources and asks again.
     pub(super) fn preempt(&mut self, context: &mut Context<'_>, holder: InstanceId, by: Option<InstanceId>) {
         context.note(Note::Preempted { instance: holder, by });
         self.step_back(context, holder, Wait::Nothing);
@@ -585,7 +585,7 @@ fn is_cacheable(context: &Context<'_>, instance: &Instance) -> bool {
         && matches!(context.program.state(instance.state).kind, StateKind::Action { .. })
 }
 
-/// The variables in sight, with their values.
+/// The variables in scope, with their values.
 fn variables(context: &Context<'_>, view: &View<'_>) -> Vec<(String, ratn_model::value::Value)> {
     let environment = &view.instance.environment;
     let names = environment.variables.iter().map(|(name, _)| name);

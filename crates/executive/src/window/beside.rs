@@ -1,7 +1,7 @@
-//! Regions beside each other, and the facts that they share. Lines know nothing of each other: what a region sees ahead of its place is the root
-//! with its own changes alone. So what another region makes real is, for what has not come to its place yet, a change from outside: what was
-//! computed of it is made again, and what was decided by it is decided again, as the sequential program would have found it there. What is under
-//! way at its place goes on, as it would there.
+//! Facts that concurrent regions share. Lines do not see each other: what a region computes ahead is based on the root and on its own changes.
+//! So a commit by another region is a change from outside for everything that has not come to its place yet: computations and decisions based on
+//! the old values are made again, with the values that the sequential program would find there. A node that is under way at its place goes on,
+//! as in the sequential program.
 
 use super::Window;
 use super::graph::instance::Instance;
@@ -10,18 +10,18 @@ use crate::protocol::Command;
 use ratn_model::fact::{Change, FactPattern, Footprint};
 use ratn_model::id::{InstanceId, StateId};
 
-/// A region: the fork, and the state that the region is.
+/// A region: its fork, and the state that is the region.
 pub(super) type Region = (InstanceId, StateId);
 
-/// Facts that a region has changed and that regions beside it may look at.
+/// Shared facts that a region has changed, for the regions beside it.
 pub(super) struct Crossing {
-    /// The region, within those around it, the outermost first.
+    /// The region that changed them, with those around it, the outermost first.
     by: Vec<Region>,
     facts: Vec<FactPattern>,
 }
 
 impl Window {
-    /// An instance has made these changes real.
+    /// Notes shared facts among committed changes.
     pub(super) fn note_crossing<'c>(
         &mut self,
         context: &Context<'_>,
@@ -39,7 +39,7 @@ impl Window {
         }
     }
 
-    /// A routine has made changes real by the commands since these.
+    /// Notes shared facts that a routine has committed, from command `since` on.
     pub(super) fn note_crossings_of_routine(&mut self, context: &Context<'_>, id: InstanceId, since: usize) {
         let changes = context.commands[since..].iter().filter_map(|command| match command {
             Command::Commit { changes, .. } => Some(changes),
@@ -48,7 +48,7 @@ impl Window {
         self.note_crossing(context, id, changes.flatten());
     }
 
-    /// What regions have changed is told to those beside them; whether there was anything.
+    /// Notifies the other regions of changed shared facts; true if there were any.
     pub(super) fn tell_of_crossings(&mut self, context: &mut Context<'_>) -> bool {
         let mut any = false;
         while !self.crossings.is_empty() && self.end.is_none() {
@@ -63,11 +63,11 @@ impl Window {
     fn tell_of_crossing(&mut self, context: &mut Context<'_>, Crossing { by, facts }: Crossing) {
         self.follow_root(context);
         self.graph.unsettle_all();
-        // What is behind it in its own region has known of it.
+        // Instances in its own region have taken these changes into account.
         let is_elsewhere = |instance: &&Instance| !regions_around(instance).starts_with(&by);
         let elsewhere: Vec<InstanceId> = self.graph.iter().filter(is_elsewhere).map(|instance| instance.id).collect();
         for id in &elsewhere {
-            // What it changes may be made of these facts.
+            // Its effects may depend on these facts.
             self.memory.mark(*id);
             let Some(instance) = self.graph.get(*id) else { continue };
             let seen = |fact: &&FactPattern| instance.seen().is_some_and(|seen| seen.overlaps(fact));
@@ -80,13 +80,13 @@ impl Window {
         self.decide_again(context, elsewhere, &Footprint::Patterns(facts));
     }
 
-    /// Whether the sequential program would be at it, too: all before it in its region has come to its end.
+    /// Whether the sequential program would also be at it: everything before it in its region has ended.
     fn is_at_its_place(&self, instance: &Instance) -> bool {
         instance.is_head && instance.is_under_way() && self.older_beside(instance).is_none()
     }
 
-    /// Of an instance in a region that uses some facts which regions share: an older imprecise PIA that still runs. Before that has ended, the
-    /// sequential program would not be at the place of the instance, and might find these facts otherwise when it comes there.
+    /// The older imprecise PIA that an instance must wait for, because the instance is in a region and uses shared facts. While that PIA runs,
+    /// the sequential program would not be at the instance's place yet, and could find other facts there later.
     pub(super) fn beside_of_shared(
         &self,
         context: &Context<'_>,
@@ -101,7 +101,7 @@ impl Window {
     }
 }
 
-/// The regions that an instance is in, the outermost first.
+/// The regions around an instance, the outermost first.
 fn regions_around(instance: &Instance) -> Vec<Region> {
     let mut regions = Vec::new();
     let mut inner = instance.state;
@@ -114,7 +114,7 @@ fn regions_around(instance: &Instance) -> Vec<Region> {
     regions
 }
 
-/// Whether the sequential program executes one of two instances before the other: they are not in regions beside each other.
+/// Whether the sequential program orders two instances: they are not in concurrent regions.
 pub(super) fn is_in_order(one: &Instance, other: &Instance) -> bool {
     let (one, other) = (regions_around(one), regions_around(other));
     let parting = one.iter().zip(&other).find(|(one, other)| one != other);

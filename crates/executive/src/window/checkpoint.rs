@@ -1,5 +1,5 @@
-//! The window's part of a checkpoint: itself, but for what its places share, which is beside it, and the projections of its routines,
-//! which are what they have otherwise than the root.
+//! The window's part of a checkpoint: its own fields, plus what its places share, plus the projections of its routines as differences
+//! from the root.
 
 use super::Window;
 use super::growth::environment::{Collector, Places};
@@ -12,11 +12,11 @@ use ratn_model::tolerance::Tolerance;
 use ratn_world::world::World;
 use serde::{Deserialize, Serialize};
 
-/// What a window is beside its own fields.
+/// The parts of a window that are stored beside its own fields.
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct Beside<'a> {
     places: Places<'a>,
-    /// Of every routine under way that works on a projection, oldest first.
+    /// By routine under way on a projection, oldest first: base and changes.
     projections: Vec<(Revision, Vec<Change>)>,
 }
 
@@ -31,7 +31,7 @@ impl Window {
         Beside { places: places.finish(), projections }
     }
 
-    /// The window as it was, from its own fields.
+    /// Restores the window from its own fields and these parts.
     pub(crate) fn restore(
         &mut self,
         plan: &Plan,

@@ -1,5 +1,5 @@
-//! Decisions of the window without a worker: conditions, lists of loops, deciders, what composite states do at
-//! their ends, the end of the task.
+//! Decisions of the window that need no worker: conditions, lists of loops, deciders, entries and exits of composite
+//! states, the end of the task.
 
 use super::graph::instance::{Ended, Instance, Role};
 use super::growth::environment::{ASSIGNED, assigned};
@@ -19,12 +19,12 @@ use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, StateKind, VIOLATED};
 use ratn_model::value::Value;
 
 impl Window {
-    /// What a decision from these expressions waits for.
+    /// What a decision by these expressions waits for, if anything.
     pub(super) fn undecidable(&mut self, context: &Context<'_>, id: InstanceId, from: &[&Expr]) -> Option<Wait> {
         undecidable(&mut self.graph, &self.memory, context, id, from)
     }
 
-    /// A node with several ways on has ended: its outcome decides once it cannot change any more.
+    /// Decides by the outcome of a node with several arms, once its result is settled.
     pub(super) fn decide_by_outcome(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.revise(context);
         if let Some(blocker) = unsettled(&mut self.graph, &self.memory, context, id) {
@@ -32,7 +32,7 @@ impl Window {
         }
         let Some(instance) = self.graph.get(id) else { return };
         let Some(ended) = instance.ended() else { return };
-        // `requires` is evaluated on the actual world when it retires, and may make another outcome of it.
+        // `requires` is checked in the actual world when the node retires, and may change the outcome.
         if !context.program.state(instance.state).annotations.requires.is_empty() {
             return self.wait(id, Wait::Order);
         }
@@ -48,7 +48,7 @@ impl Window {
         }
     }
 
-    /// A condition, or the test of a `while`.
+    /// Decides a condition, or the test of a `while`.
     pub(super) fn decide(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.revise(context);
         let Some(instance) = self.graph.get(id) else { return };
@@ -77,7 +77,7 @@ impl Window {
         self.take_arm(context, id, taken);
     }
 
-    /// The list of a loop.
+    /// Decides the list of a loop.
     pub(super) fn count(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.revise(context);
         let Some(instance) = self.graph.get(id) else { return };
@@ -111,7 +111,6 @@ impl Window {
         self.growth.unroll(&self.graph, context, id, elements);
     }
 
-    /// The decider over the outcomes of regions.
     pub(super) fn decide_join(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.revise(context);
         let Some(instance) = self.graph.get(id) else { return };
@@ -161,7 +160,7 @@ impl Window {
         self.growth.leave_join(&self.graph, id, number, because);
     }
 
-    /// Variables at the entry of a composite state; outputs and assignments at its exit.
+    /// Computes a boundary: variables at the entry of a composite state; outputs and assignments at its exit.
     pub(super) fn compute_boundary(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.follow_root(context);
         let Some(instance) = self.graph.get(id) else { return };
@@ -180,7 +179,7 @@ impl Window {
         self.end_instance(id, ended);
     }
 
-    /// The values of what is computed at a boundary, in order, each under its name; and what they are made of.
+    /// Evaluates the parts of a boundary in order, each under its name; also returns the facts that they depend on.
     pub(super) fn compute_parts(
         &self,
         context: &Context<'_>,
@@ -194,23 +193,23 @@ impl Window {
         let mut outputs = Outputs::new();
         let mut seen = Seen::default();
         for (name, expression, what) in parts {
-            // Assignments may be made of the outputs.
+            // Assignments may use the outputs.
             let value = self.look(context, instance.id, Some(&outputs), |instance, view| {
                 let mut looked = Seen::default();
                 let value = expression.evaluate(view).map_err(|error| {
-                    // Left by an outcome of its own, before it was written: there is nobody to wait for.
+                    // The state was left early by an outcome of its own, so nobody will write this port.
                     let missing = error.is_not_yet_known() && view.blocker().is_none();
                     let is_left_out = missing && !is_success(leaves_by) && !name.starts_with(ASSIGNED);
                     (!is_left_out).then(|| not_bound(view, &BindError::at(&what, state)(error)))
                 });
                 let facts = facts_of([expression], view);
-                // More may be looked at than was needed: it may not be known yet, and still it was looked at.
+                // Facts that are not known yet still count as read, even if they turn out not to be needed.
                 if view.see(facts.clone(), &mut looked).is_err() {
                     looked.look_at(facts);
                 }
                 let is_made = !matches!(value, Err(Some(Readiness::Waits(_))));
                 if is_made {
-                    // What made it fail may come out otherwise, too.
+                    // A failure may come out differently, too.
                     view.use_outputs(view.sight.producers_of(view.instance));
                     view.register(Purpose::Result);
                 }
@@ -228,7 +227,7 @@ impl Window {
         (Ok(outputs), seen)
     }
 
-    /// Everything older has retired: the task is over.
+    /// Everything older has retired: ends the run with the task's outputs.
     pub(super) fn end_run(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(instance) = self.graph.get(id) else { return };
         if !instance.is_head {
@@ -266,12 +265,12 @@ impl Window {
     }
 }
 
-/// The two decisions of a condition or of a test.
+/// The names of the two decisions of a condition or of a test.
 pub(super) fn names_of(instance: &Instance) -> [&'static str; 2] {
     if instance.role() == Some(Role::Test) { ["again", "done"] } else { ["then", "else"] }
 }
 
-/// The outcome of a concurrency whose decider says nothing.
+/// The outcome of a concurrency if its decider gives none.
 fn default_outcome(outcomes: &[String]) -> &'static str {
     if outcomes.iter().all(|outcome| outcome == SUCCESS) {
         SUCCESS
@@ -282,7 +281,7 @@ fn default_outcome(outcomes: &[String]) -> &'static str {
     }
 }
 
-/// What is computed at a boundary: under which name, from which expression, and what it is for messages.
+/// The parts of a boundary: the name of each, its expression, and its description for messages.
 fn parts_of<'p>(context: &Context<'p>, instance: &Instance) -> Vec<(String, &'p Expr, String)> {
     let state = context.program.state(instance.state);
     let own = context.plan.state(instance.state);

@@ -16,12 +16,12 @@ use std::borrow::Cow;
 use std::collections::BTreeSet;
 
 impl Window {
-    /// A decision is made: the other arms are discarded.
+    /// Applies a decision: the arms that are not taken are discarded.
     pub(super) fn take_arm(&mut self, context: &mut Context<'_>, id: InstanceId, taken: usize) {
         let (pruned, certain) = self.graph.take_arm(id, taken);
         self.discard(context, &pruned);
         self.growth.arm_taken(id);
-        // What was speculative on the way to this decision is not any more, and everything behind it has become likelier.
+        // Instances that depended only on this decision become certain, and everything behind it becomes more likely.
         for member in certain {
             self.dispatch.became_certain(member);
             self.waits.enqueue(&mut self.graph, member);
@@ -29,7 +29,7 @@ impl Window {
         self.ask_again(context);
     }
 
-    /// Everything behind an instance is discarded.
+    /// Discards everything behind an instance.
     pub(super) fn cut_behind(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let pruned = self.graph.cut_behind(id);
         self.discard(context, &pruned);
@@ -51,7 +51,7 @@ impl Window {
             && !self.is_ending
         {
             match node.status {
-                // A motion beside a failed one: it ends as it ends, and what it does stands.
+                // A motion beside a failed one runs to its end, and its effects stay.
                 Status::Running(_) | Status::RunningRoutine(..) => {
                     instance.memory.forget_users();
                     return self.graph.orphan(id);
@@ -70,20 +70,19 @@ impl Window {
         }
     }
 
-    /// An instance has left the window.
     pub(super) fn forget(&mut self, id: InstanceId) {
         self.dispatch.forget(id);
         self.results.forget(id);
         self.memory.unmark(id);
     }
 
-    /// The run ends where it is: what motions have done is real, and everything else in the window is discarded.
+    /// Ends the run now: motions that have ended become real, everything else in the window is discarded.
     pub(super) fn stop(&mut self, context: &mut Context<'_>, outcome: &str, reason: String) {
         self.make_done_real(context);
         self.discard_all(context, outcome, reason);
     }
 
-    /// Motions that have ended, and could not become real before older ones beside them did, do so; their lines go on behind them.
+    /// Retires motions that have ended but were waiting for older ones beside them; their lines go on.
     fn make_done_real(&mut self, context: &mut Context<'_>) {
         let program = context.program;
         let is_done = |head: &&Instance| {
@@ -111,7 +110,7 @@ impl Window {
         self.end = Some(super::End::new(outcome, reason));
     }
 
-    /// The same, and what is to be done on the way out of the states in which it is.
+    /// Like `stop`, but the end also contains the way out (`finally`) of the states that are entered.
     pub(super) fn cut_short(&mut self, context: &mut Context<'_>, outcome: &str, reason: String) {
         self.make_done_real(context);
         let way_out = self.way_out(context);
@@ -121,8 +120,7 @@ impl Window {
         }
     }
 
-    /// The states with something to do on the way out that are entered and not left, per line: where its oldest instance stands the sequential
-    /// program would be, too.
+    /// The entered states with a `finally`, by line: the oldest instance of a line is where the sequential program would be.
     fn way_out(&self, context: &Context<'_>) -> WayOut {
         let mut way = WayOut::default();
         let mut forks = BTreeSet::new();
@@ -130,7 +128,7 @@ impl Window {
         for head in self.graph.active_heads() {
             let routine = self.status_of_routine(head.id);
             let within = routine.and_then(|routine| routine.way_out_within(context.program, &mut way));
-            // A join and an exit stand behind what the state contains, and the state is not left yet.
+            // A join or an exit comes after everything inside of its state, but the state is not left yet.
             let is_in = matches!(head.role(), Some(Role::Join | Role::Exit));
             let path = |environment: &Environment| {
                 environment.path(&context.program.state(head.state).name, head.visit, head.iteration)
@@ -146,8 +144,8 @@ impl Window {
         way
     }
 
-    /// Of one line, as far as the fork at which it begins: that, with the concurrency and its path. `own` is the state where the line stands, if
-    /// that is not left yet, `within` what a routine there is in.
+    /// Adds the way out of one line, up to its fork, which is returned with the concurrency and its path. `own` is the state at the line's head
+    /// if it is not left yet, `within` the place inside of a routine there.
     fn add_way_out(
         &self,
         context: &Context<'_>,
@@ -161,7 +159,7 @@ impl Window {
         let fork = frames().find_map(|frame| Some((frame.fork?, (frame.owner, frame.path.to_string()))));
         let of_line = frames().take_while(|frame| frame.fork.is_none());
         let frames = of_line.map(|frame| (frame.owner, frame.path.to_string()));
-        // Whether the last thing to be done is under way already.
+        // Whether the `finally` is under way already.
         let mut inside = None;
         let places = own.into_iter().chain(frames).map(|(owner, path)| {
             let last = program.state(owner).annotations.finally.as_ref().and_then(|f| f.lastly.get(PREEMPTED));
@@ -177,7 +175,7 @@ impl Window {
             });
             let looping = environment.loop_variables(program);
             let looping = looping.map(|(name, value)| (name.to_owned(), value.into_owned()));
-            // What the routine has assigned meanwhile hides what was assigned before it.
+            // Later bindings win: what the routine has assigned replaces earlier values.
             scoped.chain(looping).chain(within.variables).collect()
         };
         let outputs = || {
@@ -189,7 +187,7 @@ impl Window {
         fork
     }
 
-    /// What a variable is now, by its place among those in sight. What is still under way (an imprecise motion) has assigned nothing yet.
+    /// The present value of a variable, by its index among those in scope. An imprecise motion that still runs has assigned nothing yet.
     fn variable_now<'a>(
         &'a self,
         sight: Sight<'a>,
@@ -210,7 +208,7 @@ impl Window {
         }
     }
 
-    /// The outputs of a state now, likewise.
+    /// The present outputs of a state, found in the same way.
     fn outputs_now<'a>(
         &'a self,
         sight: Sight<'a>,

@@ -1,4 +1,4 @@
-//! The end of a node's attempt: with a result, without an answer, too late; and what is tried again.
+//! The end of a node's attempt: with a result, by a crash, or by a timeout; and retries.
 
 use super::Window;
 use super::graph::instance::{Changed, Ended, Held, Instance, Status};
@@ -15,7 +15,7 @@ use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, PREEMPTED, STOPPED, SUCCESS, StateKind};
 
 impl Window {
-    /// An attempt has ended, with or without an answer.
+    /// An attempt has ended, with a result or by a crash.
     pub(super) fn attempt_ended(&mut self, context: &mut Context<'_>, event: Event) {
         let (Event::Finished { instance: id, attempt, .. } | Event::Crashed { instance: id, attempt, .. }) = &event
         else {
@@ -45,7 +45,7 @@ impl Window {
         }
     }
 
-    /// What is due happens.
+    /// Handles the timers that are due.
     pub(super) fn fire(&mut self, context: &mut Context<'_>) {
         while let Some(timer) = self.waits.next_due(context.now) {
             match timer {
@@ -79,7 +79,7 @@ impl Window {
         }
     }
 
-    /// A goal has ended: that is the result, unless it is tried again.
+    /// A goal has ended: finishes the node with its result, unless it is tried again.
     fn goal_ended(&mut self, context: &mut Context<'_>, id: InstanceId, ended: Ended) {
         let Some(instance) = self.graph.get(id) else { return };
         let tries = instance.node().map_or(1, |node| node.tries);
@@ -102,7 +102,7 @@ impl Window {
         }
     }
 
-    /// A node's result is known: it gives back what it held.
+    /// A node's result is known: gives back its resources.
     pub(super) fn finish(&mut self, context: &mut Context<'_>, id: InstanceId, mut ended: Ended) {
         let Some(instance) = self.graph.get(id) else { return };
         let state = context.program.state(instance.state);
@@ -133,7 +133,7 @@ impl Window {
         self.end_node(context, id, ended);
     }
 
-    /// A node has come to its end, and holds nothing any more. One that others were let pass becomes real: nobody of its line comes to it any more.
+    /// Ends a node that holds nothing any more. A detached PIA, which its line has already passed, retires at once.
     pub(super) fn end_node(&mut self, context: &mut Context<'_>, id: InstanceId, ended: Ended) {
         self.end_instance(id, ended);
         if self.graph.get(id).is_some_and(Instance::is_detached) {
@@ -141,7 +141,7 @@ impl Window {
         }
     }
 
-    /// An instance has ended: whoever waited for it is looked at, and whoever has used what was predicted of it.
+    /// Ends an instance: those that waited for it are examined, and the users of its predicted results are revised.
     pub(super) fn end_instance(&mut self, id: InstanceId, ended: Ended) {
         self.graph.end(id, ended);
         self.memory.mark(id);
@@ -150,7 +150,7 @@ impl Window {
         self.waits.enqueue(&mut self.graph, id);
     }
 
-    /// There is a result: whoever would compute the same, or waits for another instance that does, can have it.
+    /// A result is known: instances that would compute the same, or wait for one that does, are examined.
     pub(super) fn wake_twins(&mut self, id: InstanceId) {
         for twin in self.results.twins_of(id) {
             self.waits.enqueue(&mut self.graph, twin);
@@ -158,7 +158,7 @@ impl Window {
         }
     }
 
-    /// What an action assigns to variables is part of its result.
+    /// Adds the values that an action assigns to variables to its result.
     pub(super) fn assign(&self, context: &Context<'_>, id: InstanceId, ended: &mut Ended) -> Result<(), String> {
         let Some(instance) = self.graph.get(id) else { return Ok(()) };
         let state = context.program.state(instance.state);
@@ -179,19 +179,19 @@ impl Window {
         Ok(())
     }
 
-    /// An attempt ended without an answer.
+    /// An attempt has ended without an answer.
     fn crashed(&mut self, context: &mut Context<'_>, id: InstanceId, reason: &str, unknown: bool) {
         let Some(instance) = self.graph.get(id) else { return };
         let Some(node) = instance.node() else { return };
         let limit = context.program.state(instance.state).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
         let (is_pia, attempt) = (instance.is_pia(), node.attempt);
         let is_held = is_pia && matches!(node.status, Status::Granted(_));
-        // One that had not begun asks again when it may: only what it held is gone.
+        // A node that had not begun only loses what it held, and asks again when it may.
         if !is_held {
             let crashes = self.graph.count_crash(id);
             if is_pia || crashes >= limit {
                 let ended = Ended::aborted(format!("crashed in attempt {attempt}: {reason}"));
-                // Who may have moved does not move once more.
+                // A motion that may have been performed is not repeated.
                 return if is_pia && unknown {
                     self.finish(context, id, ended)
                 } else {
@@ -205,7 +205,7 @@ impl Window {
         self.waits.enqueue(&mut self.graph, id);
     }
 
-    /// It does not hold anything any more, nor does it act or look.
+    /// The node holds nothing and runs nothing any more.
     pub(super) fn rest(&mut self, id: InstanceId) {
         self.dispatch.end(id);
         self.waits.wake(&mut self.graph, id);
@@ -220,7 +220,7 @@ impl Window {
         }
     }
 
-    /// The run ends while a PIA is under way: what it says of being cut short is true.
+    /// The run ends while a PIA is under way: commits its `preempted` effects.
     fn say_cut_short(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(instance) = self.graph.get(id).filter(|instance| instance.is_pia()) else { return };
         let Some(declared) = context.program.state(instance.state).annotations.effects.get(PREEMPTED) else { return };
@@ -228,12 +228,12 @@ impl Window {
             self.look(context, id, None, |_, view| effects::actual(Some(declared), PREEMPTED, &[], view).ok());
         if let Some(changes) = changes.flatten() {
             let writer = self.path(context.program, id);
-            // The run ends anyway.
+            // Errors do not matter: the run ends anyway.
             let _ = context.commit(id, writer, changes.into());
         }
     }
 
-    /// Takes back what was asked for a node; it holds nothing afterwards.
+    /// Cancels or withdraws whatever is under way for a node; it holds nothing afterwards.
     pub(super) fn stop_node(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.harvest(context, id);
         let Some(node) = self.graph.node(id) else { return };
@@ -263,7 +263,7 @@ impl Window {
 
     // ── routines ──
 
-    /// An event for the nodes inside of a routine.
+    /// Passes an event on to the routines that contain its instance.
     pub(super) fn in_routine(&mut self, context: &mut Context<'_>, event: Event) {
         let inside = match &event {
             Event::Granted { instance, .. }
@@ -292,7 +292,7 @@ impl Window {
         }
     }
 
-    /// Time has passed for the nodes inside of routines, too.
+    /// Lets the nodes inside of routines handle timers that are due.
     pub(super) fn wake_routines(&mut self, context: &mut Context<'_>) {
         let routines: Vec<InstanceId> =
             self.dispatch.active().filter(|id| self.status_of_routine(*id).is_some()).collect();
@@ -319,7 +319,7 @@ impl Window {
         let Progress::Ended { outcome, reason } = progress else { return };
         let Some(state) = self.graph.get(id).map(|instance: &Instance| instance.state) else { return };
         let Some(routine) = self.graph.end_routine(id) else { return };
-        // Where it gives none, those that it knows of itself are of its visit before.
+        // If the state gave no outputs, those that the routine still has are of an earlier visit.
         let own = routine.outputs().get(&state).filter(|_| gives_outputs(&outcome));
         let mut outputs = own.cloned().unwrap_or_default();
         for name in &context.plan.state(state).assigns {

@@ -1,14 +1,14 @@
-//! Results that get better until they are needed.
+//! Anytime results: they are improved until they are needed.
 //!
 //! ```text
 //! goal ── first result ── better ── better ──┬─ a motion begins that uses it        ┐
-//!           │ finished: whoever             ├─ what it holds is wanted, or deleted  ├─ harvested: the best counts, what it
-//!           ▼ computes with it goes on      ├─ it is discarded, or made again       │  held is given back
+//!           │ finished: instances           ├─ its resources are wanted or deleted  ├─ harvested: the best result counts,
+//!           ▼ that use it go on             ├─ it is discarded, or made again       │  its resources are given back
 //!                                           ├─ a motion begins that it would see     │
 //!                                           └─ its provider has no better one       ┘
 //! ```
-//! What anybody may have used before a motion begins stays as it was at first ([`crate::plan`], `improves`): nothing is made again because
-//! of an improvement, and what becomes of the world does not depend on when it is harvested.
+//! Outputs that may have been used before a motion begins stay as in the first result ([`crate::plan`], `improves`). So an improvement never causes
+//! anything to be made again, and the effects on the world do not depend on the time of the harvest.
 
 use super::Window;
 use super::graph::instance::{Ended, Instance, Status};
@@ -23,12 +23,12 @@ use ratn_model::id::InstanceId;
 use ratn_model::program::{SUCCESS, StateKind};
 use std::collections::BTreeSet;
 
-/// So long somebody waits for what is held only to improve a result, or is speculative, where it was not known that there is too little for both, in
-/// seconds.
+/// An instance waits this long, in seconds, before improving or speculative holders give way, if it was not known that the resources do not suffice
+/// for both.
 const PATIENCE_S: f64 = 0.1;
 
 impl Window {
-    /// A goal has a result and goes on: the first finishes its instance, others are kept until they are used.
+    /// A goal has a result and goes on improving. The first result finishes its instance, later ones are kept until they are used.
     pub(super) fn improved(&mut self, context: &mut Context<'_>, id: InstanceId, attempt: u32, outputs: Outputs) {
         if self.improving.is(id, attempt) {
             return self.keep_best(context, id, outputs);
@@ -38,7 +38,7 @@ impl Window {
             instance.node().is_some_and(|node| node.attempt == attempt && matches!(node.status, Status::Running(_)));
         let StateKind::Action { outputs: declared, .. } = &context.program.state(instance.state).kind else { return };
         let may = context.plan.state(instance.state).improves.is_some();
-        // What is not whole is no result: the goal goes on, and says in the end what comes of it.
+        // An incomplete result is ignored: the goal goes on and reports a result at its end.
         if !is_running || !may || binding::missing_output(declared, &outputs).is_some() {
             return;
         }
@@ -49,22 +49,22 @@ impl Window {
         self.improving.begin(id, Improvement { state, attempt, held, senses, producer, best: None });
         self.finish(context, id, Ended::with(SUCCESS, outputs));
         if self.graph.get(id).is_some_and(|instance| instance.outputs().is_none()) {
-            // What it assigns could not be worked out.
+            // The values that it assigns could not be evaluated.
             return self.harvest(context, id);
         }
-        // Some may have waited for what it holds since before it had a result.
+        // Instances may have waited for its resources since before it had a result.
         let asking: Vec<InstanceId> = self.dispatch.active().filter(|id| self.asks(*id)).collect();
         asking.into_iter().for_each(|id| self.make_room(context, id));
     }
 
-    /// A goal whose result is there has ended, however: what it gave last counts.
+    /// A goal that was improving its result has ended, in whatever way: its last result counts.
     pub(super) fn improvement_ended(&mut self, context: &mut Context<'_>, id: InstanceId) {
         if let Some(improvement) = self.settle_best(id) {
             release(context, id, &improvement);
         }
     }
 
-    /// Better outputs, if they are what may be: whole, and as at first in what somebody may have used.
+    /// Keeps better outputs, if they are complete and do not change an output that may have been used.
     fn keep_best(&mut self, context: &Context<'_>, id: InstanceId, outputs: Outputs) {
         let Some(improvement) = self.improving.get_mut(id) else { return };
         let StateKind::Action { outputs: declared, .. } = &context.program.state(improvement.state).kind else {
@@ -78,8 +78,8 @@ impl Window {
         }
     }
 
-    /// A result is to be used, or what it holds is wanted, or nobody wants it any more: the goal is told to stop, and its best counts.
-    /// Nothing where it does not get better.
+    /// Stops improving, because the result is used, its resources are wanted, or it is discarded: cancels the goal; its best result counts. Does
+    /// nothing if it is not improving.
     pub(super) fn harvest(&mut self, context: &mut Context<'_>, id: InstanceId) {
         if let Some(improvement) = self.settle_best(id) {
             context.commands.push(Command::Cancel { instance: id, attempt: improvement.attempt });
@@ -87,7 +87,7 @@ impl Window {
         }
     }
 
-    /// The best outputs are the outputs from now on.
+    /// Makes the best outputs the final ones.
     fn settle_best(&mut self, id: InstanceId) -> Option<Improvement> {
         let mut improvement = self.improving.end(id)?;
         let Some(best) = improvement.best.take() else { return Some(improvement) };
@@ -104,8 +104,8 @@ impl Window {
         Some(improvement)
     }
 
-    /// A motion begins: what it uses is final, and so is what was seen of what it changes: from now on it would be in the picture. Whether any of
-    /// it was not.
+    /// A motion begins: stops improving results that it uses, and sensing of what it may change, because the motion would be seen. True if any was
+    /// stopped.
     pub(super) fn harvest_for(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
         if self.improving.is_empty() {
             return false;
@@ -120,7 +120,7 @@ impl Window {
         context.commands.len() > before
     }
 
-    /// Who goes on looking at what an instance may change.
+    /// Instances that are still sensing facts which this instance may change.
     fn would_see(&self, context: &Context<'_>, instance: &Instance) -> Vec<InstanceId> {
         let looking = self.improving.iter().filter(|(_, improvement)| !improvement.senses.is_nothing());
         let mut looking = looking.peekable();
@@ -131,7 +131,7 @@ impl Window {
         looking.filter(|(_, improvement)| improvement.senses.overlaps(&writes)).map(|(id, _)| id).collect()
     }
 
-    /// What is deleted or used up now nobody holds any more only to improve a result.
+    /// Harvests the instances that hold resources which this event deletes or consumes.
     pub(super) fn harvest_what_is_removed(&mut self, context: &mut Context<'_>) {
         if self.improving.is_empty() {
             return;
@@ -149,14 +149,14 @@ impl Window {
         context.commands.extend(behind);
     }
 
-    /// The run is over.
+    /// The run is over: harvests everything.
     pub(super) fn harvest_all(&mut self, context: &mut Context<'_>) {
         let all: Vec<InstanceId> = self.improving.iter().map(|(id, _)| id).collect();
         all.into_iter().for_each(|id| self.harvest(context, id));
     }
 
-    /// An instance is about to ask for resources. Where there is not enough for it and for what only gets better, the latter gives way; where
-    /// that is not known, it does so after a while, and so does what is speculative.
+    /// An instance is about to ask for resources. If these do not suffice for it and for holders that only improve a result, the latter give way
+    /// now; if that is not known, they and the speculative holders give way after a while.
     pub(super) fn make_room(&mut self, context: &mut Context<'_>, id: InstanceId) {
         if !self.improving.is_empty() {
             let in_the_way = self.dispatch.too_much(&self.graph, context.plan, &self.improving, id);
@@ -168,7 +168,7 @@ impl Window {
         }
     }
 
-    /// An instance has waited for resources for a while: whoever holds such only to improve a result, or is speculative, gives way.
+    /// An instance has waited for resources for a while: holders that only improve a result, or are speculative, give way.
     pub(super) fn make_way_for(&mut self, context: &mut Context<'_>, id: InstanceId) {
         if self.asks(id) {
             let holders: Vec<InstanceId> = self.holders_of_what(context, id).collect();
@@ -178,7 +178,7 @@ impl Window {
         }
     }
 
-    /// Whether an instance waits for resources: also a routine that asks for them anew.
+    /// Whether an instance waits for resources; includes a routine that asks for a new lease.
     fn asks(&self, id: InstanceId) -> bool {
         match self.graph.node(id).map(|node| &node.status) {
             Some(Status::Acquiring { .. }) => true,
@@ -187,7 +187,7 @@ impl Window {
         }
     }
 
-    /// Who holds, only to improve a result, a kind that an instance wants.
+    /// Instances that only improve a result and hold a kind that this instance wants.
     fn holders_of_what<'a>(
         &'a self,
         context: &'a Context<'_>,

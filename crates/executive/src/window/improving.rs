@@ -1,4 +1,4 @@
-//! Results that are there and still get better: which goals go on, what they hold, the best that they have given.
+//! Results that are still being improved: the goals that go on, what they hold, and the best results so far.
 
 use super::graph::Graph;
 use super::graph::instance::Held;
@@ -11,19 +11,19 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// The goals that go on although their result is there, by instance. The instance may have retired.
+/// The goals that go on although they have a result, by instance. The instance may have retired.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Improving(BTreeMap<InstanceId, Improvement>);
 
-/// A goal that goes on.
+/// A goal that goes on improving its result.
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct Improvement {
     pub(crate) state: StateId,
     pub(crate) attempt: u32,
     pub(crate) held: Held,
-    /// What it goes on looking at, if it senses.
+    /// The facts that it goes on sensing, if it senses.
     pub(crate) senses: Footprint,
-    /// Where its outputs stand.
+    /// The producer that stores its outputs.
     #[serde(skip)]
     pub(crate) producer: Arc<Producer>,
     /// The best outputs since the first.
@@ -36,7 +36,7 @@ impl Improving {
         self.0.insert(id, improvement);
     }
 
-    /// Whether this attempt of an instance goes on.
+    /// Whether this attempt of an instance is still improving.
     pub(crate) fn is(&self, id: InstanceId, attempt: u32) -> bool {
         self.0.get(&id).is_some_and(|improvement| improvement.attempt == attempt)
     }
@@ -49,12 +49,12 @@ impl Improving {
         self.0.get_mut(&id)
     }
 
-    /// It does not go on.
+    /// The goal stops improving.
     pub(crate) fn end(&mut self, id: InstanceId) -> Option<Improvement> {
         self.0.remove(&id)
     }
 
-    /// All of them, those that began first before the others.
+    /// All of them, oldest instance first.
     pub(crate) fn iter(&self) -> impl Iterator<Item = (InstanceId, &Improvement)> {
         self.0.iter().map(|(id, improvement)| (*id, improvement))
     }
@@ -63,12 +63,12 @@ impl Improving {
         self.0.is_empty()
     }
 
-    /// What they share with places of the program.
+    /// Collects their producers for a checkpoint.
     pub(crate) fn collect<'a>(&'a self, places: &mut Collector<'a>) {
         self.0.values().for_each(|improvement| places.add_producer(&improvement.producer));
     }
 
-    /// Gives back what they shared.
+    /// Restores their producers.
     pub(crate) fn restore(&mut self, places: &mut Restored) -> Result<(), Broken> {
         for (id, improvement) in &mut self.0 {
             improvement.producer = places.producer()?;
@@ -79,7 +79,7 @@ impl Improving {
         Ok(())
     }
 
-    /// What is wrong, if anything: what gets better is there.
+    /// Checks that every improving instance has a result.
     pub(crate) fn check_invariants(&self, graph: &Graph) -> Result<(), String> {
         for (id, improvement) in &self.0 {
             let is_there = match graph.get(*id) {

@@ -1,34 +1,34 @@
-//! The window: the instances expanded and not yet retired, executed out of order.
+//! The window: the instances that are expanded and have not retired, executed out of order.
 //!
-//! It is made of owners, each with private state and a few verbs; what takes several of them is a file of its own here, and can
-//! do no more than those verbs.
+//! It consists of owners, each with private state and a few methods. An operation on several owners has a file of its own here and
+//! uses only those methods.
 //!
 //! | owner | of what |
 //! |---|---|
 //! | [`graph`] | the instances: their order, lines, branches, the heads of lines |
 //! | [`growth`] | cursors, where the window grows |
-//! | [`memory`] | the world as it is at a place of the program, its readers, what cannot change any more |
-//! | [`waits`] | which instance waits for which other one, the queue, timers |
+//! | [`memory`] | the world at each place of the program, its readers, settled results |
+//! | [`waits`] | which instance waits for which other instance, the queue, timers |
 //! | [`dispatch`] | running instances, priorities, which speculative holder gives way |
 //! | [`results`] | the result cache |
-//! | [`improving`] | results that are there and still get better |
+//! | [`improving`] | results that are still being improved |
 //!
 //! | what happens | |
 //! |---|---|
 //! | `ready`, `begin` | a node may begin, asks for its resources, gets its projection, runs |
 //! | `waiting` | a state waits, without a provider |
-//! | `finish` | its goal ends, its worker dies, it is tried again |
-//! | `harvest` | its result is there, and gets better until somebody uses it or wants what it holds |
+//! | `finish` | a goal ends, a worker dies, a node is tried again |
+//! | `harvest` | an anytime result is improved until it is used or its resources are wanted |
 //! | `decide` | conditions, lists of loops, deciders, ends of composite states |
-//! | `retire` | what becomes real, in program order per line |
-//! | `revise` | what was made of something that came out otherwise is made again |
+//! | `retire` | results become real, in program order per line |
+//! | `revise` | results are made again whose inputs came out otherwise |
 //! | `outside` | the world changes from outside |
 //! | `beside` | a region changes facts that regions beside it look at |
-//! | `discard` | paths that are not taken |
+//! | `discard` | paths that are not taken are removed |
 //!
-//! Lines retire in program order, so the root world always is the world after a prefix of the program: a failure is precise, and
-//! a projection is the root plus the effects of the older instances on the path. Three moments of a result: *finished* feeds data
-//! flows and projections; *settled* cannot change any more and decides conditions and loops; *retired* is real.
+//! Lines retire in program order, so the root world is always the world after a prefix of the program: a failure is precise, and a
+//! projection is the root plus the effects of the older instances on the path. A result has three stages: *finished* feeds data
+//! flows and projections; *settled* can no longer change and decides conditions and loops; *retired* is real.
 
 mod begin;
 mod beside;
@@ -76,13 +76,12 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use waits::{Timer, Wait, Waits};
 
-/// How a run ended.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct End {
     pub(crate) outcome: String,
     pub(crate) outputs: Outputs,
     pub(crate) reason: String,
-    /// What is still to be done before.
+    /// The way out (`finally`) that is executed before the end.
     pub(crate) way_out: WayOut,
 }
 
@@ -93,7 +92,7 @@ impl End {
     }
 }
 
-/// CDTN mode.
+/// The state of CDTN mode.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Window {
     graph: Graph,
@@ -107,16 +106,16 @@ pub(crate) struct Window {
     hold: Hold,
     end: Option<End>,
     is_ending: bool,
-    /// The root has changed or a signal has come since the waits under way were looked at.
+    /// Whether the root has changed or a signal has come since waits under way were last checked.
     #[serde(skip)]
     may_end_waits: bool,
-    /// What these assign is otherwise since the event came.
+    /// Instances that have assigned other values since the event came.
     #[serde(skip)]
     assigned_again: BTreeSet<InstanceId>,
-    /// What regions have changed, and those beside them have not been told.
+    /// Shared facts that regions have changed and of which the regions beside them were not told yet.
     #[serde(skip)]
     crossings: Vec<Crossing>,
-    /// So many commands of the event have been looked through for commits.
+    /// Number of this event's commands that `follow_root` has handled.
     #[serde(skip)]
     followed: usize,
 }
@@ -150,7 +149,7 @@ impl Window {
         }
     }
 
-    /// Begins.
+    /// Begins the run.
     pub(crate) fn start(&mut self, context: &mut Context<'_>) -> Option<End> {
         if let Some(deadline_s) = context.program.deadline_s {
             self.set_timer(context, deadline_s, Timer::Deadline);
@@ -158,11 +157,12 @@ impl Window {
         self.go_on(context)
     }
 
-    /// What is due happens, before an event is taken; the end of the run, when this was it: the event then comes after that.
+    /// Handles due timers before an event; returns the end of the run if a timer ended it, because the event then comes after the
+    /// end.
     pub(crate) fn before(&mut self, context: &mut Context<'_>, event: &Event) -> Option<End> {
         self.followed = 0;
         self.assigned_again.clear();
-        // An operator was told that his answer has come: the time that is up at this very moment does not throw it away.
+        // The operator was told that the answer has arrived: a timeout at this very moment does not discard it.
         if let Event::Answered { instance, choice } = event {
             self.answer(context, *instance, choice);
         }
@@ -170,7 +170,7 @@ impl Window {
         self.end.take()
     }
 
-    /// Takes an event; the end of the run, when this was it.
+    /// Handles an event; returns the end of the run if it ended.
     pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Option<End> {
         match event {
             Event::Granted { .. } | Event::Refused { .. } | Event::Projected { .. } => self.answered(context, event),
@@ -218,7 +218,7 @@ impl Window {
         end
     }
 
-    /// Looks, retires, revises and grows until nothing changes.
+    /// Examines, retires, revises and grows until nothing changes.
     fn go_on(&mut self, context: &mut Context<'_>) -> Option<End> {
         loop {
             while self.end.is_none()
@@ -248,7 +248,7 @@ impl Window {
         }
     }
 
-    /// Looks at an instance that may go on.
+    /// Lets an instance go on, if it can.
     fn examine(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(instance) = self.graph.get(id) else { return };
         let has_ended = instance.ended().is_some();
@@ -269,7 +269,7 @@ impl Window {
         }
     }
 
-    /// Grows where there is room; whether it did.
+    /// Grows up to the horizon; true if anything was appended.
     fn grow(&mut self, context: &mut Context<'_>) -> bool {
         let grew = self.growth.grow(&mut self.graph, context);
         if grew && Dispatch::is_estimate_due(self.graph.len(), self.growth.grown()) {
@@ -281,7 +281,7 @@ impl Window {
         grew
     }
 
-    /// PIAs that may begin, and those beside that may try again.
+    /// The operator's holds have changed: examines heads, and detached PIAs, which may have a further try.
     fn look_at_those_held(&mut self) {
         let heads = self.graph.heads().map(|head| head.id);
         let held: Vec<InstanceId> = heads.chain(self.graph.detached().iter().copied()).collect();
@@ -290,17 +290,16 @@ impl Window {
         }
     }
 
-    /// These are the breakpoints from now on.
     pub(crate) fn break_at(&mut self, program: &Program, breakpoints: Vec<String>) {
         self.hold.break_at(program, breakpoints);
     }
 
-    /// As [`crate::executive::Executive::breakpoints`].
+    /// The breakpoints; see [`crate::executive::Executive::breakpoints`].
     pub(crate) fn breakpoints(&self) -> &[String] {
         self.hold.breakpoints()
     }
 
-    /// What every instance that has not begun waits for.
+    /// What every instance that has not begun waits for, as sentences.
     pub(crate) fn waits(&self, program: &Program) -> Vec<String> {
         let is_waiting = |instance: &&Instance| {
             instance.node().is_some_and(|node| matches!(node.status, Status::Expanded | Status::Acquiring { .. }))
@@ -310,7 +309,7 @@ impl Window {
         waiting.map(|instance| instance.waiting.wait().sentence(&named(instance.id), named)).collect()
     }
 
-    /// What is still to be done, as a scheduling problem.
+    /// The remaining work as a scheduling problem.
     pub(crate) fn outlook(&self, context: &Context<'_>) -> lookahead::Problem {
         self.dispatch.outlook(self.sight(context), context.now)
     }
@@ -327,8 +326,8 @@ impl Window {
         self.memory.sight(context.program, context.plan, context.root, &self.graph)
     }
 
-    /// Looks from where an instance stands, with its own outputs if it has ended. What is looked for is looked for again when
-    /// something far away had to be forecast first.
+    /// Calls `look` with the view of an instance, with its own outputs if it has ended. The call is repeated if forecasts at the end
+    /// of a deep chain had to be made first.
     fn look<'a, T>(
         &'a self,
         context: &'a Context<'_>,
@@ -349,7 +348,7 @@ impl Window {
         move |key| context.program.tolerances.of(&key.predicate, base)
     }
 
-    /// What is known of the root's facts, and of how much there is of each kind of resource, takes into account what was done since.
+    /// Updates what is derived from the root and from the capacities with the commits and operations made since the last call.
     fn follow_root(&mut self, context: &Context<'_>) {
         let mut has_changed = false;
         for command in &context.commands[self.followed.min(context.commands.len())..] {
@@ -369,13 +368,13 @@ impl Window {
         self.followed = context.commands.len();
     }
 
-    /// Something happens so many seconds from now.
+    /// Sets a timer that is due after so many seconds.
     fn set_timer(&mut self, context: &mut Context<'_>, after_s: f64, timer: Timer) {
         let at = self.waits.set_timer(context.now, after_s, timer);
         context.commands.push(Command::Wake { at });
     }
 
-    /// What is wrong with the window between two events, if anything.
+    /// Checks the window between two events.
     pub(crate) fn check_invariants(&self) -> Result<(), String> {
         if self.is_ending {
             return Ok(());
@@ -395,7 +394,7 @@ impl Window {
         Ok(())
     }
 
-    /// Who could go on and was not woken, if anybody: everything that waits is looked at again.
+    /// Finds an instance that could go on and was not woken: every instance is examined again.
     pub(crate) fn check_quiescence(&mut self, context: &mut Context<'_>) -> Result<(), String> {
         let all: Vec<InstanceId> = self.graph.iter().map(|instance| instance.id).collect();
         for id in all {

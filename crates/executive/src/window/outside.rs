@@ -1,9 +1,9 @@
-//! Changes of the world from outside the run: a fact expired, or another client wrote one.
+//! Changes of the world from outside the run: a fact has expired, or another client has written one.
 //!
-//! What is real stands, and so does a motion under way, as it would in HSM mode. Of the rest, whatever was made of a fact that is
-//! otherwise now is made again, settled or not; and a decision that would be another one now is made again where it stands: what
-//! was expanded behind it is discarded. Nothing behind has begun that could not be discarded, for no PIA begins before its decisions
-//! have retired. Rare, so it may look at the whole window.
+//! Retired results stay, and so does a motion under way, as in HSM mode. Everything else that depends on a changed fact is made
+//! again, settled or not. A decision that would now be different is made again in place, and what was expanded behind it is
+//! discarded. Nothing behind it has begun that could not be discarded, because no PIA begins before its decisions have retired. Such
+//! changes are rare, so examining the whole window is acceptable.
 
 use super::Window;
 use super::decide::names_of;
@@ -18,17 +18,17 @@ use ratn_model::program::{Program, StateKind};
 use ratn_model::value::Value;
 use ratn_world::world::World;
 
-/// In the outputs of a loop that has looked into the world: its list.
+/// The output of a loop with its list, if the list depends on facts.
 const ELEMENTS: &str = "elements";
 
 impl Window {
-    /// The root is about to be changed so from outside.
+    /// Compares changes from outside with the root, before they are applied to it.
     pub(crate) fn compare_outside(&mut self, program: &Program, root: &World, facts: &[(FactKey, Option<Value>)]) {
         let base = self.tolerance;
         self.memory.compare_outside(root, facts, |key| program.tolerances.of(&key.predicate, base));
     }
 
-    /// These facts are otherwise in the root than they were.
+    /// These facts of the root have changed from outside.
     pub(super) fn world_changed<'a>(&mut self, context: &mut Context<'_>, facts: impl Iterator<Item = &'a FactKey>) {
         let changed: Vec<FactPattern> = facts.map(FactPattern::of).collect();
         self.memory.root_changed(context.root, changed.iter().cloned());
@@ -37,7 +37,7 @@ impl Window {
         let all: Vec<InstanceId> = self.graph.iter().map(|instance| instance.id).collect();
         self.graph.unsettle_all();
         for id in &all {
-            // What it changes may be made of these facts.
+            // Its effects may depend on these facts.
             self.memory.mark(*id);
             let Some(instance) = self.graph.get(*id) else { continue };
             let exact = self.exact(context, instance);
@@ -53,18 +53,18 @@ impl Window {
         self.decide_again(context, all, &changed);
     }
 
-    /// Those among some instances that would not decide so again do, now that these facts are otherwise.
+    /// Decides again, among these instances, all decisions that the changed facts may have made wrong.
     pub(super) fn decide_again(&mut self, context: &mut Context<'_>, all: Vec<InstanceId>, changed: &Footprint) {
         for id in &all {
             if self.may_decide_otherwise(context, *id) || self.decides_otherwise(context, *id, changed) {
                 self.reopen(context, *id);
             }
         }
-        // What waited for an older instance to make the world as it has to be may have got it so, and the other way round.
+        // Instances that waited for the world to change may go on now, and others have to wait.
         all.into_iter().for_each(|id| self.waits.enqueue(&mut self.graph, id));
     }
 
-    /// The first of some facts of the root that an instance has looked at, and no writer between hides from it.
+    /// The first of some facts of the root that an instance has read and that no writer in between hides.
     fn has_seen<'p>(
         &self,
         context: &Context<'_>,
@@ -79,14 +79,14 @@ impl Window {
         })
     }
 
-    /// Whether an instance has decided from what may still change now: an older instance may write other facts than it would have.
+    /// Whether a decision is no longer settled, because an older instance may now write other facts.
     fn may_decide_otherwise(&mut self, context: &Context<'_>, id: InstanceId) -> bool {
         let Some(instance) = self.graph.get(id).filter(|instance| instance.ended().is_some()) else { return false };
         let expressions = decides_from(context.program, instance);
         !expressions.is_empty() && self.undecidable(context, id, &expressions).is_some()
     }
 
-    /// Whether an instance has decided and would not do so again.
+    /// Whether a decision would now be different.
     fn decides_otherwise(&self, context: &Context<'_>, id: InstanceId, changed: &Footprint) -> bool {
         let Some(instance) = self.graph.get(id) else { return false };
         let Some(ended) = instance.ended() else { return false };
@@ -118,7 +118,7 @@ impl Window {
         decides.unwrap_or(false)
     }
 
-    /// It decides again; what is behind it is discarded and expanded anew.
+    /// Decides again: what is behind is discarded and expanded again.
     fn reopen(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.cut_behind(context, id);
         self.graph.reopen(id);
@@ -128,7 +128,7 @@ impl Window {
     }
 }
 
-/// What a condition, a test, a loop or a decider decides from.
+/// The expressions by which a condition, a test, a loop or a decider decides.
 pub(super) fn decides_from<'p>(program: &'p Program, instance: &Instance) -> Vec<&'p Expr> {
     match (&program.state(instance.state).kind, instance.role()) {
         (StateKind::Condition { predicate, .. }, Some(Role::Condition)) => vec![predicate],
@@ -139,7 +139,7 @@ pub(super) fn decides_from<'p>(program: &'p Program, instance: &Instance) -> Vec
     }
 }
 
-/// The list of a loop, for comparison.
+/// The list of a loop, kept for later comparison.
 pub(super) fn remembered(elements: List) -> (String, Value) {
     (ELEMENTS.to_owned(), Value::List(elements))
 }

@@ -1,4 +1,4 @@
-//! Readiness of a node: the first thing that is missing before it may ask for its resources.
+//! Readiness of a node: finds the first thing that is missing before it may ask for its resources.
 
 use super::Window;
 use super::beside::is_in_order;
@@ -18,15 +18,15 @@ use ratn_model::resource::Requirement;
 
 /// Whether a node may begin.
 pub(super) enum Readiness {
-    /// With these resources and, of what is no PIA, these inputs.
+    /// Ready, with these requirements and, unless it is a PIA, these inputs.
     Ready(Vec<Requirement>, Option<Outputs>),
     /// Waiting. The [`Wait`] names the instance to wait for; without one, another event will re-examine this one.
     Waits(Wait),
-    /// It never will: the reason it ends `aborted`.
+    /// It can never begin: it ends `aborted` for this reason.
     Failed(String),
 }
 
-/// What an instance reads and writes.
+/// The facts that an instance reads and writes.
 struct Touches {
     reads: Footprint,
     writes: Footprint,
@@ -57,7 +57,7 @@ impl Window {
         if node.crashes > 0
             && let Some(decision) = self.graph.undecided(instance)
         {
-            // What kills workers is not tried again before it is known to be needed.
+            // A node that has crashed workers is not tried again before it is certain that it is needed.
             return Readiness::Waits(Wait::Decision(decision));
         }
         let variables = own.variables.iter().map(String::as_str);
@@ -96,7 +96,7 @@ impl Window {
             Ok(None) => {}
             Ok(Some(reason)) => {
                 let required = facts_of(&state.annotations.requires, view);
-                // On a projection it only holds back; in the actual world it is decided.
+                // On a projection an unmet precondition means waiting; in the actual world it means failure.
                 match view.sight.writer_of(view.instance, Looked::at(&required)).filter(|_| !is_pia) {
                     Some(writer) => return Readiness::Waits(Wait::World(writer)),
                     None => return Readiness::Failed(reason),
@@ -124,7 +124,7 @@ impl Window {
         Readiness::Ready(requirements, bound)
     }
 
-    /// Sensing nodes and those that change what they look at keep out of each other's way; the older goes first.
+    /// Keeps sensing nodes and nodes that change the sensed facts apart; the older one goes first.
     fn keep_out_of_the_way(&self, context: &Context<'_>, instance: &Instance, view: &View<'_>) -> Option<Wait> {
         let others = || self.dispatch.active().filter(|id| *id != instance.id).filter_map(|id| self.graph.get(id));
         match instance.node()?.nature {
@@ -153,16 +153,16 @@ impl Window {
         }
     }
 
-    /// An imprecise PIA that still runs beside an instance, although older, and must end before it begins, or becomes real.
+    /// A detached PIA, older than the instance, that must end before the instance begins or retires, because of conflicting facts or resources.
     pub(super) fn conflict_beside(&self, context: &Context<'_>, instance: &Instance) -> Option<InstanceId> {
-        // A wait looks at what is real, and changes nothing.
+        // A wait reads the root only, and changes nothing.
         if self.graph.detached().is_empty() || context.program.state(instance.state).is_pause() {
             return None;
         }
         let own = context.plan.state(instance.state);
         let mut mine = self.touches(context, instance);
         if own.imprecise && instance.is_pia() && instance.ended().is_none() {
-            // It retires as soon as it ends, whatever its outcome.
+            // It will retire as soon as it ends, whatever its outcome.
             let writes = self.look(context, instance.id, None, |_, view| {
                 let declared = own.effects.iter().filter_map(|effects| match effects {
                     Effects::Declared(declared) => Some(EffectExpr::footprint(declared, view)),
@@ -175,7 +175,7 @@ impl Window {
         if let Some(beside) = self.beside_of_shared(context, instance, [&mine.reads, &mine.writes]) {
             return Some(beside);
         }
-        // What it deletes or uses up at its end may be held beside it.
+        // A resource that it deletes or consumes at its end may be held by the other.
         let operates = matches!(instance.role(), None | Some(Role::Exit));
         let uses = |other: &Instance| {
             let kinds = &context.plan.state(other.state).kinds;
@@ -183,7 +183,7 @@ impl Window {
         };
         self.graph.detached().iter().copied().filter(|id| *id < instance.id).find(|id| {
             let Some(other) = self.graph.get(*id) else { return false };
-            // The facts that regions beside each other share have no order.
+            // Facts that concurrent regions share are not ordered.
             let conflicts = || {
                 let its = self.touches(context, other);
                 its.writes.overlaps(&mine.reads)
@@ -194,8 +194,8 @@ impl Window {
         })
     }
 
-    /// An older imprecise PIA that still runs, of its line, of one around that, or of one that has been left. A wait does not begin beside it: a
-    /// signal that it took would be lost if that one fails and its path is left.
+    /// An older detached PIA that the sequential program executes before the instance. A wait does not begin beside one: the signal that it
+    /// takes would be lost if the PIA fails and the wait's path is left.
     pub(super) fn older_beside(&self, instance: &Instance) -> Option<InstanceId> {
         let is_before = |id: &InstanceId| {
             let other = self.graph.get(*id).filter(|other| other.id < instance.id);
@@ -204,7 +204,7 @@ impl Window {
         self.graph.detached().iter().copied().find(is_before)
     }
 
-    /// An imprecise PIA that still runs beside an instance and whose outputs it is made of, its effects included.
+    /// A detached PIA whose outputs the instance uses, also in its effects.
     pub(super) fn producer_beside<'a>(&self, sight: Sight<'a>, instance: &'a Instance) -> Option<InstanceId> {
         if self.graph.detached().is_empty() {
             return None;
@@ -212,8 +212,8 @@ impl Window {
         sight.producers_of(instance).find(|producer| self.graph.detached().contains(producer))
     }
 
-    /// What an instance reads or requires, at its beginning or at its end, and what it may write: with the outcome that it had, else
-    /// with any that is computed ahead.
+    /// The facts that an instance reads or requires, at its beginning or at its end, and those that it may write: with its outcome if it has
+    /// ended, else with any outcome that is computed ahead.
     fn touches(&self, context: &Context<'_>, instance: &Instance) -> Touches {
         self.look(context, instance.id, None, |instance, view| {
             let state = context.program.state(instance.state);
@@ -228,7 +228,7 @@ impl Window {
             };
             reads = reads.union(facts_of(&state.annotations.requires, view));
             reads = reads.union(facts_of(decides_from(context.program, instance), view));
-            // What its effects are made of is read when it ends.
+            // Its effects look up facts when it ends.
             reads = reads.union(FactExpr::footprint(&own.effect_lookups, view));
             let ended = instance.ended().and_then(|ended| own.outcome(&ended.outcome));
             let outcomes: Vec<usize> = match (instance.marker(), ended) {
@@ -239,7 +239,7 @@ impl Window {
                     (0..own.outcomes.len().min(MAX_OUTCOMES)).filter(|n| ahead & (1 << n) != 0).collect()
                 }
             };
-            // What a wait foresees it does not do.
+            // A wait does not make the changes that it foresees.
             let outcomes = if state.is_pause() { Vec::new() } else { outcomes };
             let link = |outcome| Link { writer: instance.id, outcome, vague: false };
             let each = outcomes.into_iter().map(|outcome| view.sight.may_write_along(view, link(outcome)));
@@ -248,12 +248,12 @@ impl Window {
         .unwrap_or(Touches { reads: Footprint::NOTHING, writes: Footprint::NOTHING })
     }
 
-    /// What an instance may write.
+    /// The facts that an instance may write.
     pub(super) fn writes(&self, context: &Context<'_>, instance: &Instance) -> Footprint {
         self.touches(context, instance).writes
     }
 
-    /// What a sensing instance looks at.
+    /// The facts that a sensing instance senses.
     pub(super) fn senses(&self, context: &Context<'_>, instance: &Instance) -> Footprint {
         let senses = &context.plan.state(instance.state).senses;
         let looked = self.look(context, instance.id, None, |_, view| FactExpr::footprint(senses, view));
@@ -261,8 +261,8 @@ impl Window {
     }
 }
 
-/// The facts that a computing or sensing node reads, as they are at its place; a sensing one only when the environment shows
-/// them so.
+/// Reads the facts of a computing or sensing node at its place. A sensing node has to wait until the root shows the facts that it senses as they
+/// will be at its place.
 pub(super) fn look(context: &Context<'_>, view: &View<'_>, nature: NodeNature) -> Result<Seen, Wait> {
     let own = context.plan.state(view.instance.state);
     let blocked = |Blocked(writer)| Wait::World(writer);

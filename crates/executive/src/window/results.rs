@@ -1,8 +1,8 @@
-//! The result cache. The same visit of a state on two branches computes the same once; a result that was discarded serves
-//! again when the same is asked for.
+//! The result cache. The same visit of a state on two branches is computed once; a discarded result is used again when the same
+//! computation is asked for.
 //!
-//! A result is found by its seed (run, path with visits, and try) and by what it was made of: with equal seeds, inputs and facts
-//! the result is the same.
+//! The key of a result is its seed (run, path with visits, and try) and its inputs: with equal seed, input ports and facts the
+//! result is the same.
 
 use super::graph::Graph;
 use super::graph::instance::Ended;
@@ -11,34 +11,34 @@ use ratn_model::id::InstanceId;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 
-/// This many results are kept.
+/// Limit of kept results.
 const MAX_RESULTS: usize = 1024;
 
-/// Results by seed, and who computes what.
+/// Results by seed, and the instances that compute them.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Results {
     kept: BTreeMap<u64, Vec<(Seen, Ended)>>,
     order: VecDeque<u64>,
-    /// Speculative instances that compute or have computed, by seed and by id.
+    /// Speculative instances that compute or have computed a result, by seed and by id.
     twins: BTreeMap<u64, Vec<InstanceId>>,
     seeds: BTreeMap<InstanceId, u64>,
 }
 
-/// What is known of a result that is asked for.
+/// What the cache knows about a requested result.
 pub(crate) enum Known {
-    /// It is there.
+    /// The result.
     Result(Box<Ended>),
     /// This instance computes it.
     Busy(InstanceId),
 }
 
 impl Results {
-    /// Whether nothing is kept: then only speculative instances need to ask.
+    /// Whether no result is kept; then only speculative instances need to ask.
     pub(crate) fn is_empty(&self) -> bool {
         self.order.is_empty()
     }
 
-    /// A result made of the same, or who computes it.
+    /// A result with the same inputs, or the instance that computes it.
     pub(crate) fn find(&self, graph: &Graph, id: InstanceId, seed: u64, seen: &Seen) -> Option<Known> {
         let same = |other: &Seen| other.is_like(seen);
         let kept = self.kept.get(&seed).and_then(|all| all.iter().find(|(other, _)| same(other)));
@@ -60,7 +60,7 @@ impl Results {
         busy
     }
 
-    /// A speculative instance computes what others may want. Whether it computed something else before.
+    /// Notes a speculative instance whose result others may use; true if it was noted with another seed before.
     pub(crate) fn note_twin(&mut self, id: InstanceId, seed: u64) -> bool {
         let before = self.seeds.insert(id, seed).filter(|before| *before != seed);
         if let Some(before) = before {
@@ -73,7 +73,7 @@ impl Results {
         before.is_some()
     }
 
-    /// The others that compute what this one does.
+    /// The other instances with the same computation.
     pub(crate) fn twins_of(&self, id: InstanceId) -> Vec<InstanceId> {
         let twins = self.seeds.get(&id).and_then(|seed| self.twins.get(seed));
         twins.into_iter().flatten().copied().filter(|other| *other != id).collect()
@@ -95,7 +95,7 @@ impl Results {
         }
     }
 
-    /// A result that is about to be discarded is kept.
+    /// Keeps a result that is about to be discarded.
     pub(crate) fn keep(&mut self, seed: u64, seen: Seen, ended: Ended) {
         self.kept.entry(seed).or_default().push((seen, ended));
         self.order.push_back(seed);
@@ -110,7 +110,7 @@ impl Results {
         }
     }
 
-    /// What is wrong, if anything: only instances in the window are twins.
+    /// Checks that only instances in the window are twins.
     pub(crate) fn check_invariants(&self, graph: &Graph) -> Result<(), String> {
         match self.seeds.keys().find(|id| !graph.contains(**id)) {
             Some(gone) => Err(format!("{gone} computes what others may want, and is not in the window")),

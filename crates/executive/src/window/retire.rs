@@ -1,8 +1,8 @@
-//! Retirement: what becomes real. Every line retires in program order, so the root is the world after a prefix of the program
-//! (per region), and a failure leaves it so.
+//! Retirement: results become real. Every line retires in program order, so the root is the world after a prefix of the program (per region), and
+//! a failure leaves it so.
 //!
-//! A PIA with imprecise exceptions is passed over while it runs: it retires when it ends, and younger ones may run beside it. The
-//! exit of a state, and the end of a region, wait for those inside.
+//! A PIA with imprecise exceptions is passed over while it runs: younger instances may run beside it, and it retires when it ends. The exit of a
+//! state, and the end of a region, wait for such PIAs inside.
 
 use super::Window;
 use super::graph::instance::{Changed, Ended, Instance, Role, Status};
@@ -22,40 +22,40 @@ use smallvec::SmallVec;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// What became real.
+/// What an instance has made real.
 struct Real {
-    /// The outcome by which the instance is left, and why.
+    /// Outcome and reason of the instance in the actual world.
     outcome: Arc<str>,
     reason: String,
     changes: Vec<Change>,
-    /// What the facts were that it wrote; only where somebody has looked at what it would write.
+    /// The earlier values of the facts that it wrote; only if its predicted changes had readers.
     before: BTreeMap<FactKey, Option<Value>>,
 }
 
 impl Real {
-    /// Whether a result came to nothing when it was to become real.
+    /// Whether the result failed when it was to become real.
     fn is_other_than(&self, ended: &Ended) -> bool {
         (&self.outcome, &self.reason) != (&ended.outcome, &ended.reason)
     }
 }
 
-/// What the users of an instance that becomes real are to be told.
+/// What the users of a retiring instance are told.
 struct News {
     users: SmallVec<[User; 2]>,
     difference: Difference,
-    /// It has no outputs after all.
+    /// Whether it has no outputs after all.
     is_open: bool,
 }
 
 impl Window {
-    /// Retires what can be; whether there was anything.
+    /// Retires everything that can retire; true if anything did.
     pub(super) fn retire(&mut self, context: &mut Context<'_>) -> bool {
         let mut retired = false;
         let mut last = None;
         while let Some(line) = self.graph.next_active_line(last) {
             last = Some(line);
             while self.end.is_none() {
-                // Nothing may become real that was decided by what another region has changed since.
+                // A decision that depends on facts changed by another region must be made again before it retires.
                 retired |= self.tell_of_crossings(context);
                 let Some(id) = self.graph.head_of(line) else { break };
                 if self.passes(context, id) {
@@ -73,8 +73,7 @@ impl Window {
         retired
     }
 
-    /// Whether an imprecise PIA runs and lets younger ones begin: those of the way of its success. What is on the way of another outcome alone is
-    /// computed ahead, and waits.
+    /// Whether the head is an imprecise PIA that runs and may be passed over, because only one way on, that of its success, is computed ahead.
     fn passes(&self, context: &Context<'_>, id: InstanceId) -> bool {
         self.graph.get(id).is_some_and(|head| {
             head.is_pia()
@@ -85,7 +84,7 @@ impl Window {
         })
     }
 
-    /// The oldest instance of a line becomes real; false when it may not yet.
+    /// Retires the head of a line; false if it may not retire yet.
     fn retire_head(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
         let Some(instance) = self.graph.get(id) else { return false };
         if let Some(beside) = self.conflict_beside(context, instance) {
@@ -104,7 +103,7 @@ impl Window {
         true
     }
 
-    /// The oldest instance of a line becomes real.
+    /// Retires the head of a line now.
     pub(super) fn retire_now(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(instance) = self.graph.get(id) else { return };
         let (role, line, position) = (instance.role(), instance.line, instance.position);
@@ -123,12 +122,12 @@ impl Window {
             Some(Role::End) => {}
             _ => self.follow(context, id, &real.outcome, real.reason),
         }
-        // Nothing younger may become real that was made of what came out otherwise.
+        // Younger results with changed inputs must be revised before they retire.
         self.tell_news(context, id, &news);
         self.revise(context);
     }
 
-    /// Whether a line has gone on for too long without an action; then the run has ended.
+    /// Stops the run if a line has gone in circles (too many visits without an action); true if it did.
     pub(super) fn goes_in_circles(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
         let Some(instance) = self.graph.get(id) else { return false };
         let is_too_long =
@@ -137,7 +136,7 @@ impl Window {
         let reason = match routine {
             Some(reason) => reason,
             None if !is_too_long => return false,
-            // The test of a loop stands beside the loop.
+            // The test of a loop is a place beside the loop, not in its body.
             None if instance.role() == Some(Role::Test) => {
                 let name = &context.program.state(instance.state).name;
                 in_circles(&instance.environment.path(name, instance.visit, None))
@@ -148,8 +147,8 @@ impl Window {
         true
     }
 
-    /// Of the exit of a state, or the end of a region: an imprecise PIA inside that still runs. By how it ends the state may be
-    /// left otherwise.
+    /// For the exit of a state or the end of a region: a detached PIA inside that still runs. The way in which it ends may change how the state
+    /// is left.
     fn inside_beside(&self, end: &Instance) -> Option<InstanceId> {
         let role = end.role()?;
         let is_inside = |id: &&InstanceId| {
@@ -164,7 +163,7 @@ impl Window {
         matches!(role, Role::Exit | Role::RegionEnd).then(|| self.graph.detached().iter().find(is_inside).copied())?
     }
 
-    /// The line goes on behind an instance that is real, where its outcome leads.
+    /// Continues the line behind a retired instance, along its outcome.
     fn follow(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: &str, reason: String) {
         let Some(instance) = self.graph.get(id) else { return };
         let own = context.plan.state(instance.state);
@@ -193,8 +192,7 @@ impl Window {
         }
     }
 
-    /// An instance ended otherwise than was computed ahead: what was expanded behind it is discarded, and the path goes on where
-    /// its outcome leads.
+    /// An instance ended otherwise than computed ahead: discards everything behind it and continues the path where its outcome leads.
     fn leave_path(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: Outcome, reason: String) {
         let path = self.path(context.program, id);
         let because: Arc<str> = if reason.is_empty() { path.into() } else { format!("{path}: {reason}").into() };
@@ -207,7 +205,7 @@ impl Window {
         let (line, position, state) = (instance.line, instance.position, instance.state);
         let producer = instance.producer.clone().filter(|_| instance.role().is_none());
         let mut environment = instance.environment.clone();
-        // The variables of the state itself are gone with it.
+        // The state's own variables go out of scope.
         if state != Program::ROOT && matches!(instance.role(), Some(Role::Exit | Role::Loop | Role::Test)) {
             let own = context.program.state(state).variables.len();
             environment.variables.truncate(environment.variables.len().saturating_sub(own));
@@ -218,7 +216,7 @@ impl Window {
         self.graph.advance(line, position, None);
     }
 
-    /// Effects and resource operations happen.
+    /// Commits the effects and performs the resource operations of an instance.
     fn make_real(&mut self, context: &mut Context<'_>, id: InstanceId) -> Real {
         let mut real =
             Real { outcome: ABORTED.into(), reason: String::new(), changes: Vec::new(), before: BTreeMap::new() };
@@ -268,8 +266,8 @@ impl Window {
         real
     }
 
-    /// The outcome of an instance, its changes and its resource operations, on the actual world; `None` where what it required does
-    /// not hold: it never happened. Its reason stands in `real` then.
+    /// The outcome of an instance, its changes and its resource operations, in the actual world; `None` if a precondition does not hold there, so
+    /// that it counts as never executed. The reason is then in `real`.
     #[expect(clippy::type_complexity, reason = "three parts of one answer, used once")]
     fn what_happens(
         &self,
@@ -284,7 +282,7 @@ impl Window {
         };
         let state = context.program.state(instance.state);
         let own = context.plan.state(instance.state);
-        // What began on a projection had its preconditions checked there, if at all; now the actual world decides.
+        // Preconditions were checked on a projection, if at all; now the actual world decides.
         let checks = match instance.role() {
             None => instance.node().is_some_and(|node| node.nature != NodeNature::Irreversible),
             Some(Role::Entry) => ended.outcome.as_ref() == SUCCESS,
@@ -328,7 +326,7 @@ impl Window {
                 changes.map(|changes| Made { changes, evidence: evidence.clone() })
             }
         };
-        // A routine has performed its own.
+        // A routine has performed its operations already.
         let operations = if is_routine || own.operations.is_empty() || outcome.as_ref() != SUCCESS {
             Ok(Vec::new())
         } else {
@@ -339,7 +337,7 @@ impl Window {
         Some((outcome, made, operations))
     }
 
-    /// What was made of predicted effects is compared with what they came to.
+    /// Compares the predicted effects, on which users depend, with the actual ones.
     fn news_of_real(&mut self, context: &Context<'_>, id: InstanceId, real: &Real) -> News {
         let users = self.take_users(id);
         let mut news = News { users, difference: Difference::default(), is_open: false };
@@ -357,8 +355,7 @@ impl Window {
         news
     }
 
-    /// A result that came to nothing when it was to become real was none: it has no outputs, and a routine leaves variables as they
-    /// were.
+    /// Corrects a result that failed when it was to become real: it has no outputs, and a routine leaves variables as they were.
     fn correct(&mut self, context: &Context<'_>, id: InstanceId, real: &Real) {
         let Some(ended) = self.graph.get(id).and_then(Instance::ended) else { return };
         if !real.is_other_than(ended) {
@@ -372,7 +369,6 @@ impl Window {
         self.tell(context, id, &news.users, &news.difference, news.is_open, false);
     }
 
-    /// An imprecise PIA that others were let pass by has ended.
     pub(super) fn retire_detached(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let real = self.make_real(context, id);
         let news = self.news_of_real(context, id, &real);
@@ -391,7 +387,7 @@ impl Window {
         self.revise(context);
     }
 
-    /// A motion that has ended, and whose path was left before it could retire: what it did stands.
+    /// Retires a motion that has ended after its path was left: its effects stay.
     pub(super) fn retire_orphan(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let real = self.make_real(context, id);
         let news = self.news_of_real(context, id, &real);

@@ -1,7 +1,7 @@
-//! Revision: a result that was made of something which came out otherwise is made again, and so is what was made of it.
+//! Revision: a result whose inputs came out otherwise is made again, and so are the results that depend on it.
 //!
-//! Instances whose outputs or effects may be otherwise are marked, and looked at oldest first: each once, however many ways lead
-//! to it, and without recursion. PIAs are never made again: they begin when everything older is real.
+//! Instances whose outputs or effects may have changed are marked and examined oldest first: each once, however many dependencies lead to
+//! it, and without recursion. PIAs are never made again, because they begin when everything older is real.
 
 use super::graph::instance::{Instance, Role};
 use super::growth::environment::ASSIGNED;
@@ -16,7 +16,7 @@ use ratn_model::id::InstanceId;
 use smallvec::SmallVec;
 
 impl Window {
-    /// Looks at everything that is marked; whether anything was.
+    /// Examines all marked instances; true if there were any.
     pub(super) fn revise(&mut self, context: &mut Context<'_>) -> bool {
         let mut any = false;
         while let Some(id) = self.memory.next_stale() {
@@ -26,7 +26,7 @@ impl Window {
         any
     }
 
-    /// An instance may have put out or changed something else than its users know.
+    /// Examines a marked instance and tells its users what has changed.
     fn look_again(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(instance) = self.graph.get(id) else { return };
         if !instance.memory.has_users() && instance.waiting.waiters().is_empty() {
@@ -41,7 +41,7 @@ impl Window {
         self.tell(context, id, &users, &refreshed.difference, is_open, refreshed.is_known_now);
     }
 
-    /// Tells the users of an instance what came out otherwise. `is_open`: its outputs are not there (any more).
+    /// Tells the users of an instance about deviations. `is_open`: its outputs do not exist (any more).
     pub(super) fn tell(
         &mut self,
         context: &mut Context<'_>,
@@ -52,8 +52,8 @@ impl Window {
         is_known_now: bool,
     ) {
         for user in users.iter().filter(|user| user.of == Source::World && user.purpose == Purpose::Result) {
-            // Whoever waits for the environment to look as it does at its place looks again; and whoever waits for what another instance
-            // computes of the same, which what is tolerated makes another result.
+            // A sensing node that waits for the environment is examined again. So is an instance that waits for its twin: even a tolerated
+            // deviation makes the twin's result a different one.
             let waits = |user: &Instance| user.is_sensing() || matches!(user.waiting.wait(), Wait::Twin(_));
             if self.graph.get(user.id).is_some_and(|user| waits(user) && !user.is_under_way()) {
                 self.waits.enqueue(&mut self.graph, user.id);
@@ -78,7 +78,7 @@ impl Window {
         }
     }
 
-    /// The first of some deviations of an older instance that a reader has looked at and no younger writer hides from it.
+    /// The first deviation of an older instance that a reader has seen and no younger writer hides.
     fn concerns<'d>(
         &self,
         context: &Context<'_>,
@@ -101,8 +101,8 @@ impl Window {
         })
     }
 
-    /// The facts of which an instance does not forgive what is tolerated. Actions do, which take their time; the window's own computations
-    /// are exact.
+    /// The facts for which an instance tolerates no deviation. Actions tolerate deviations, because they are expensive; the window's own
+    /// computations do not.
     pub(super) fn exact(&self, context: &Context<'_>, instance: &Instance) -> Footprint {
         if instance.role().is_some() {
             return Footprint::Everything;
@@ -112,7 +112,7 @@ impl Window {
         exact.unwrap_or(Footprint::Everything)
     }
 
-    /// A fact came out otherwise than an instance has taken it to be.
+    /// A fact came out otherwise than an instance has seen it.
     pub(super) fn came_otherwise(
         &mut self,
         context: &mut Context<'_>,
@@ -124,7 +124,7 @@ impl Window {
         let is_forgiven =
             match (is_tolerated && instance.role().is_none(), context.plan.state(instance.state).is_routine) {
                 (false, _) => false,
-                // Of an action only what it assigns is made of what is tolerated.
+                // In an action only the assignments depend on tolerated deviations.
                 (true, false) => self.assign_again(context, id),
                 (true, true) => self.sees_the_same(context, instance),
             };
@@ -133,7 +133,7 @@ impl Window {
         }
     }
 
-    /// Whether an instance has seen the facts as they are now: it was made of them since they came out otherwise.
+    /// Whether an instance has already seen the facts as they are now, because it was computed after the change.
     pub(super) fn sees_the_same(&self, context: &Context<'_>, instance: &Instance) -> bool {
         let now = match instance.role() {
             Some(_) => Some(self.compute_parts(context, instance).1),
@@ -144,13 +144,13 @@ impl Window {
         now.is_some_and(|now| instance.seen().is_some_and(|seen| seen.saw_the_same(&now)))
     }
 
-    /// An action assigns anew, by the facts as they are now, of the result that it has, if it has one; whether that could be done.
+    /// Evaluates an action's assignments again with the present facts, if it has a result; false if that failed.
     fn assign_again(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
         let Some(instance) = self.graph.get(id) else { return true };
         let Some(ended) = instance.ended() else { return true };
         let mut again = ended.clone();
         again.outputs.retain(|port, _| !port.starts_with(ASSIGNED));
-        // It may have failed in what it was to assign.
+        // Its assignments may have failed before, too.
         if !gives_outputs(&ended.outcome) || self.assign(context, id, &mut again).is_err() {
             return false;
         }
@@ -163,12 +163,12 @@ impl Window {
         true
     }
 
-    /// A result, or what is to become one, is made again.
+    /// Discards a result, or a running attempt: it is made again.
     pub(super) fn invalidate(&mut self, context: &mut Context<'_>, id: InstanceId, reason: String) {
         let Some(instance) = self.graph.get(id) else { return };
         if !is_revisable(instance) {
             if !instance.is_under_way() && instance.ended().is_none() {
-                // It has not begun: what it waits for may be another instance now, or none.
+                // It has not begun, but may now wait for another instance, or for none.
                 self.waits.enqueue(&mut self.graph, id);
             }
             return;
@@ -185,7 +185,7 @@ impl Window {
         self.waits.enqueue(&mut self.graph, id);
     }
 
-    /// The users of an instance that leaves the window: they have nothing more to hear from it.
+    /// Takes the users of an instance that leaves the window; they hear no more from it.
     pub(super) fn take_users(&mut self, id: InstanceId) -> SmallVec<[User; 2]> {
         let Some(instance) = self.graph.get(id) else { return SmallVec::new() };
         let users = instance.memory.users();

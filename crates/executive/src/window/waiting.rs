@@ -1,8 +1,8 @@
-//! States that wait: they begin as PIAs do, at the head of their line, and no provider gets a goal. Where the root has changed or a
-//! signal has come, every wait under way is looked at, those inside of routines too.
+//! States that wait: they begin as PIAs do, at the head of their line, but no provider gets a goal. Whenever the root has changed or a
+//! signal has come, every wait under way is checked, those inside of routines too.
 //!
-//! While a wait for a condition is under way, younger instances see the facts that the condition says outright; when it ends, what the
-//! root shows takes their place. A wait never begins beside an imprecise PIA, and none is let pass: so no signal is taken on a path
+//! While a wait for a condition is under way, younger instances see the facts that its condition states literally; when it ends, the
+//! root's facts take their place. A wait never begins beside an imprecise PIA, and is never passed over, so no signal is taken on a path
 //! that is left.
 
 use super::Window;
@@ -18,7 +18,7 @@ use ratn_model::id::InstanceId;
 use ratn_model::program::VIOLATED;
 
 impl Window {
-    /// A wait has its place: it begins, unless it is over.
+    /// Begins a wait at its place; ends it at once if it is over.
     pub(super) fn begin_waiting(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(instance) = self.graph.get(id) else { return };
         let Some(attempt) = instance.node().map(|node| node.attempt) else { return };
@@ -30,7 +30,7 @@ impl Window {
             None => return,
         };
         context.note(Note::Running { instance: id, attempt });
-        // What is over at once is no action: a loop of such waits goes in circles.
+        // A wait that ends at once does not count as an action: a loop of such waits goes in circles.
         if self.ends_waiting(context, id) {
             return;
         }
@@ -47,7 +47,7 @@ impl Window {
         }
     }
 
-    /// Looks at every wait and every watched motion under way, if the world may have ended one; whether one was over.
+    /// Checks every wait and watched motion under way, if the world may have ended one; true if any ended.
     pub(super) fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
         if !std::mem::take(&mut self.may_end_waits) {
             return false;
@@ -76,7 +76,7 @@ impl Window {
         any
     }
 
-    /// Ends a wait if what it waits for is there; whether it did.
+    /// Ends a wait if its condition holds or its signal is kept; true if it ended.
     fn ends_waiting(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
         let Some(state) = self.graph.get(id).map(|instance| context.program.state(instance.state)) else {
             return false;
@@ -93,7 +93,7 @@ impl Window {
         true
     }
 
-    /// Ends an action of which a condition does not hold, before it begins or while it goes on; whether it did.
+    /// Ends an action whose `while` condition does not hold, before it begins or while it runs; true if it ended.
     pub(super) fn ends_violated(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
         let Some(instance) = self.graph.get(id) else { return false };
         let state = context.program.state(instance.state);
@@ -116,8 +116,8 @@ impl Window {
         true
     }
 
-    /// Uses the scope of a wait at its place: its variables and the ports of older instances, which are real there, and the facts of the
-    /// actual world; what imprecise PIAs of other regions will have done is not.
+    /// Calls `use_scope` with the scope of a wait at its place: its variables, the ports of older instances, which are real there, and
+    /// the facts of the actual world. Future effects of imprecise PIAs in other regions are not visible.
     fn in_reality<T>(&self, context: &Context<'_>, id: InstanceId, use_scope: impl Fn(&dyn Scope) -> T) -> Option<T> {
         self.look(context, id, None, |_, view| {
             let unknown = &Footprint::NOTHING;
@@ -125,9 +125,9 @@ impl Window {
         })
     }
 
-    /// Its time is up.
+    /// The time of a wait is up.
     pub(super) fn waited_long_enough(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        // What was waited for may have come at this very moment.
+        // Its condition may hold, or its signal may have come, at this very moment.
         if !self.ends_waiting(context, id)
             && let Some(state) = self.graph.get(id).map(|instance| context.program.state(instance.state))
         {
@@ -135,7 +135,7 @@ impl Window {
         }
     }
 
-    /// An operator has answered.
+    /// An operator has answered a question.
     pub(super) fn answer(&mut self, context: &mut Context<'_>, id: InstanceId, choice: &str) {
         let waiting = self
             .graph

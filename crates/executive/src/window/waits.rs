@@ -1,7 +1,7 @@
 //! Waits: which instance waits for which other one, the queue of instances to be examined again, and timers.
 //!
-//! An instance that cannot go on waits for exactly one other (the first thing found missing) and is looked at again when that
-//! one goes on: the work per event is proportional to what it touches, not to the window.
+//! An instance that cannot go on waits for exactly one other instance (the first thing found missing) and is examined again
+//! when that one goes on. So the work per event depends on what the event touches, not on the size of the window.
 
 use super::graph::Graph;
 use crate::span::span;
@@ -14,45 +14,45 @@ use std::collections::{BTreeSet, VecDeque};
 /// What an instance waits for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub(crate) enum Wait {
-    /// Nothing that is known; an event of its own, or somebody, will re-examine it.
+    /// Nothing known; a later event will cause this instance to be examined.
     #[default]
     Nothing,
     /// The output of another instance.
     Data(InstanceId),
-    /// What an older instance makes of the facts it reads.
+    /// The changes by an older instance of the facts that it reads.
     World(InstanceId),
-    /// The environment does not look yet as it will at this place of the program: an older instance has yet to change it.
+    /// The environment does not look yet as it will at this place: an older instance has yet to change it.
     Environment(InstanceId),
     /// Every older instance must have retired.
     Order,
-    /// A sensing node is looking at what it would change.
+    /// A sensing node that is sensing what this instance would change.
     Sensing(InstanceId),
-    /// A motion is changing what it would look at.
+    /// A motion that is changing what this instance would sense.
     Writer(InstanceId),
     /// A task resource that an older instance operates on.
     TaskResource(InstanceId),
-    /// It senses, and an older instance waits: it looks when that is over.
+    /// It senses, and an older instance is a wait that must end first.
     Waiting(InstanceId),
-    /// The same visit on another branch is computing the same.
+    /// An instance for the same visit on another branch, which computes the same.
     Twin(InstanceId),
     /// A condition on its path.
     Decision(InstanceId),
     /// A result that may still change.
     Settling(InstanceId),
-    /// Its next try.
+    /// The backoff before its next try.
     Backoff,
     /// The operator.
     Pause,
-    /// Room: what is speculative leaves some to what is not.
+    /// Room for a projection: speculative nodes leave some to certain ones.
     Room,
-    /// Others that are to have resources first, by what a look-ahead advised.
+    /// Other instances that are to have resources first, by the advice of look-ahead.
     Turn,
     /// The resource manager.
     Resources,
 }
 
 impl Wait {
-    /// The instance whose going on ends the wait.
+    /// The instance whose progress ends the wait.
     pub(crate) fn on(self) -> Option<InstanceId> {
         match self {
             Wait::Data(id)
@@ -71,7 +71,7 @@ impl Wait {
         }
     }
 
-    /// As a sentence about the instance of this path; `named` gives the paths of others.
+    /// The wait as a sentence about the instance with this path; `named` gives the paths of others.
     pub(crate) fn sentence(self, path: &str, named: impl Fn(InstanceId) -> String) -> String {
         match self {
             Wait::Nothing => format!("{path} has just been expanded"),
@@ -97,39 +97,37 @@ impl Wait {
     }
 }
 
-/// What an instance waits for and who waits for it: part of the instance, private to this module.
+/// The wait of an instance and its waiters: part of the instance, private to this module.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct WaitCell {
     wait: Wait,
-    /// To be looked at again when this ends, settles, retires or is discarded.
+    /// Instances to be examined when this one ends, settles, retires or is discarded.
     waiters: SmallVec<[InstanceId; 2]>,
     is_queued: bool,
 }
 
 impl WaitCell {
-    /// What it waits for.
     pub(crate) fn wait(&self) -> Wait {
         self.wait
     }
 
-    /// Who waits for it.
     pub(crate) fn waiters(&self) -> &[InstanceId] {
         &self.waiters
     }
 }
 
-/// What happens by itself.
+/// Events that time causes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub(crate) enum Timer {
-    /// The pause before the next try is over.
+    /// The backoff before the next try is over.
     Retry(InstanceId),
-    /// The goal of this attempt has had its time.
+    /// The goal of this attempt has reached its timeout.
     Timeout(InstanceId, u32),
-    /// It has been held back as long as it may be.
+    /// The longest time of a hold is over.
     Hold(InstanceId),
-    /// It has waited long enough for what is held only to improve a result, or is speculative.
+    /// The instance has waited long enough for holders that only improve a result or are speculative.
     Room(InstanceId),
-    /// The task has had its time.
+    /// The task has reached its deadline.
     Deadline,
 }
 
@@ -137,18 +135,18 @@ pub(crate) enum Timer {
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Waits {
     queue: VecDeque<InstanceId>,
-    /// Those that wait for the environment to look otherwise: whatever becomes real may do that.
+    /// Instances that wait for the environment to change; every commit may do that.
     for_environment: BTreeSet<InstanceId>,
     timers: BTreeSet<(Timestamp, Timer)>,
 }
 
 impl Waits {
-    /// It waits. Without an instance to wait for, an event or somebody else re-examines it.
+    /// The instance waits. Without an instance to wait for, a later event causes it to be examined.
     pub(crate) fn wait(&mut self, graph: &mut Graph, id: InstanceId, wait: Wait) {
         let Some(cell) = graph.waiting(id) else { return };
         let before = std::mem::replace(&mut cell.wait, wait);
         if matches!(before, Wait::Sensing(_)) && !matches!(wait, Wait::Sensing(_)) {
-            // Sensing nodes let a motion go first that is about to begin; now it is not.
+            // Sensing nodes had let this motion go first; it is not about to begin any more.
             self.wake(graph, id);
         }
         if matches!(wait, Wait::Environment(_)) {
@@ -161,17 +159,17 @@ impl Waits {
                         other.waiters.push(id);
                     }
                 }
-                // It went on meanwhile.
+                // That instance has left the window meanwhile.
                 None => self.enqueue(graph, id),
             }
         }
     }
 
-    /// Whoever waits for it is looked at again.
+    /// Examines all instances that wait for this one.
     pub(crate) fn wake(&mut self, graph: &mut Graph, id: InstanceId) {
         let Some(cell) = graph.waiting(id) else { return };
         let mut waiters = std::mem::take(&mut cell.waiters);
-        // In program order, whoever asked first, and however often.
+        // In program order, without duplicates, whatever the order of their waits.
         waiters.sort_unstable();
         waiters.dedup();
         for waiter in waiters {
@@ -179,7 +177,7 @@ impl Waits {
         }
     }
 
-    /// It is to be looked at.
+    /// Puts an instance into the queue, to be examined.
     pub(crate) fn enqueue(&mut self, graph: &mut Graph, id: InstanceId) {
         if let Some(cell) = graph.waiting(id)
             && !cell.is_queued
@@ -189,7 +187,7 @@ impl Waits {
         }
     }
 
-    /// The next to be looked at.
+    /// Takes the next instance to be examined.
     pub(crate) fn next(&mut self, graph: &mut Graph) -> Option<InstanceId> {
         for id in graph.take_touched() {
             self.enqueue(graph, id);
@@ -203,19 +201,19 @@ impl Waits {
         None
     }
 
-    /// The environment has changed: whoever waits for that is looked at again.
+    /// The environment has changed: instances that wait for that are examined.
     pub(crate) fn environment_changed(&mut self, graph: &mut Graph) {
         for id in std::mem::take(&mut self.for_environment) {
             self.enqueue(graph, id);
         }
     }
 
-    /// Whether somebody is to be looked at.
+    /// Whether an instance is to be examined.
     pub(crate) fn is_due(&self, graph: &Graph) -> bool {
         !self.queue.is_empty() || graph.has_touched()
     }
 
-    /// Something happens after so many seconds: when.
+    /// Sets a timer that is due after so many seconds; returns its time.
     pub(crate) fn set_timer(&mut self, now: Timestamp, after_s: f64, timer: Timer) -> Timestamp {
         let after = span(after_s);
         let at: Timestamp = now + after;
@@ -223,7 +221,7 @@ impl Waits {
         at
     }
 
-    /// Something happens at a moment.
+    /// Sets a timer for a moment.
     pub(crate) fn set_timer_at(&mut self, at: Timestamp, timer: Timer) {
         self.timers.insert((at, timer));
     }
@@ -237,7 +235,7 @@ impl Waits {
         self.timers.pop_first().map(|(_, timer)| timer)
     }
 
-    /// What is wrong, if anything, when nothing is to be looked at any more: everybody waits for somebody older who knows it.
+    /// Checks, when the queue is empty, that every waiting instance is registered with the one that it waits for.
     pub(crate) fn check_invariants(&self, graph: &Graph) -> Result<(), String> {
         for instance in graph.iter() {
             let cell = &instance.waiting;

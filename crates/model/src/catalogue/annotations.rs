@@ -1,7 +1,7 @@
-//! What an action says of every state that performs it: in a catalogue once, in place of in every state.
+//! Annotations of an action: they hold for every state that performs it, so that they need not be repeated in every state.
 //!
-//! Each text is an expression as task files have it. `$port` stands for what the state gives an input, a bare word for an output that the action
-//! writes. A state that says something under the same key is believed in its place. See `load/action.rs` for how a state comes to it.
+//! Each text is an expression as in task files. `$port` is the expression that the state gives to an input; a bare word is an output of the action.
+//! A state's own annotation under the same key takes precedence. How a state gets these annotations: `load/action.rs`.
 
 use super::ActionSignature;
 use crate::expression::Expr;
@@ -10,57 +10,58 @@ use crate::load::suggestion;
 use serde::{Deserialize, Deserializer, Serialize};
 use std::collections::BTreeMap;
 
-/// See the module. What is not said is as if no action had said it: the state then may read and change everything.
+/// The annotations; see the module. What is missing has the same default as in a task file: the state may read and change everything.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Annotations {
-    /// It reads its projection and changes nothing.
+    /// Whether it works on a projection and changes nothing.
     pub computes: bool,
-    /// Patterns of the facts that it reads, `scene` for those of the geometry; empty for none.
+    /// Patterns of the facts that it reads, `scene` for those of the geometry; an empty list: none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reads: Option<Vec<String>>,
-    /// Patterns of the facts that it senses; where there are none, it does not only look.
+    /// Patterns of the facts that it senses; an empty list: it is no sensing action.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub senses: Vec<String>,
-    /// What has to be true when it begins.
+    /// Its preconditions.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub requires: Vec<String>,
-    /// What it changes with `success`; empty for nothing.
+    /// Its effects with `success`; an empty list: none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub effects: Option<Vec<String>>,
-    /// Predicates of facts of which nothing is known after any other outcome: those that success sets are deleted then.
+    /// Predicates whose facts are unknown after any other outcome: the facts that `success` would set are deleted then.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub unknown_after_failure: Vec<String>,
-    /// Kinds of resources that it blocks one of, its provider's among them; `world_model` is room for a projection.
+    /// The resource kinds of which it blocks one each, including its provider's; `world_model` is room for a projection.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub resources: Vec<String>,
-    /// How long it usually takes, in seconds.
+    /// Its usual duration, in seconds.
     #[serde(skip_serializing_if = "Option::is_none", deserialize_with = "number_or_text")]
     pub duration: Option<String>,
-    /// It gives a result that can be used, and better ones later, until it is stopped: any of them will do. Only what computes or senses can be so.
+    /// Whether it is anytime: it gives a usable result first, and better ones until it is cancelled; any of them is acceptable. Only for actions
+    /// that compute or sense.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub anytime: bool,
-    /// What is said otherwise where a state gives an optional input, by the input: each key that stands there, in place of the one above.
+    /// By optional input: annotations that replace those above, key by key, if a state gives this input.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub given: BTreeMap<String, Annotations>,
 }
 
-/// An annotation that does not read.
+/// Error: an annotation cannot be parsed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{key}: {text}`: {message}{}{help}", if help.is_empty() { "" } else { "; " })]
 pub struct InvalidAnnotation {
-    /// Under which key.
+    /// Its key.
     pub key: &'static str,
-    /// As it is said.
+    /// Its text.
     pub text: String,
-    /// What is wrong with it.
+    /// What is wrong.
     pub message: String,
     /// What to do; may be empty.
     pub help: String,
 }
 
 impl Annotations {
-    /// Whether it says nothing.
+    /// Whether there are no annotations.
     pub fn is_empty(&self) -> bool {
         *self == Annotations::default()
     }
@@ -78,12 +79,12 @@ impl Annotations {
         ]
     }
 
-    /// Itself, and what it says where an input is given.
+    /// These annotations, and those for given inputs.
     pub fn all(&self) -> impl Iterator<Item = &Annotations> {
         std::iter::once(self).chain(self.given.values())
     }
 
-    /// What is said of a state that gives these inputs.
+    /// The annotations for a state that gives these inputs.
     pub fn of_inputs(&self, is_given: impl Fn(&str) -> bool) -> Annotations {
         let mut said = Annotations { given: BTreeMap::new(), ..self.clone() };
         for (_, other) in self.given.iter().filter(|(input, _)| is_given(input)) {
@@ -107,10 +108,10 @@ impl Annotations {
         said
     }
 
-    /// Whether every text reads, in terms of the ports of its action.
+    /// Checks that every text can be parsed, with the ports of its action.
     ///
     /// # Errors
-    /// [`InvalidAnnotation`] of the first that does not.
+    /// [`InvalidAnnotation`] for the first text that cannot.
     pub fn check(&self, signature: &ActionSignature) -> Result<(), InvalidAnnotation> {
         let wrong = |key, text: &str, message: &str, help: &str| {
             Err(InvalidAnnotation { key, text: text.to_owned(), message: message.to_owned(), help: help.to_owned() })
@@ -170,7 +171,7 @@ impl Annotations {
     }
 }
 
-/// A number, or an expression as text.
+/// Deserializes a number, or an expression as text.
 fn number_or_text<'de, D: Deserializer<'de>>(from: D) -> Result<Option<String>, D::Error> {
     #[derive(Deserialize)]
     #[serde(untagged)]
@@ -186,7 +187,7 @@ fn number_or_text<'de, D: Deserializer<'de>>(from: D) -> Result<Option<String>, 
     }))
 }
 
-/// What names stand for in an annotation of an action.
+/// The names in an annotation of an action: its ports.
 struct Ports<'s> {
     signature: &'s ActionSignature,
     has_outputs: bool,
@@ -209,7 +210,7 @@ impl Names for Ports<'_> {
     }
 }
 
-/// Why `$name` means nothing to an action; `None` where it is an input.
+/// The error for `$name` if the action has no such input; else `None`.
 pub(crate) fn unknown_input(signature: &ActionSignature, name: &str) -> Option<NameError> {
     let known = || signature.inputs.keys().chain(signature.optional.keys()).map(String::as_str);
     (!known().any(|input| input == name)).then(|| NameError {
@@ -219,7 +220,7 @@ pub(crate) fn unknown_input(signature: &ActionSignature, name: &str) -> Option<N
     })
 }
 
-/// Why an action cannot name the output of a state.
+/// The error for an output of a state, which an action's annotation cannot name.
 pub(crate) fn no_states(state: &str, port: &str) -> NameError {
     NameError {
         rule: "unknown-state",

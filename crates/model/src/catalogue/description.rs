@@ -1,5 +1,5 @@
-//! What a worker says of itself: its provider's name, the kind of resource that it is, and its actions with their ports. Somebody else's
-//! words: it is believed only within these bounds.
+//! A worker's description of itself: its provider's name, its resource kind, and its actions with their ports. It comes from outside and is
+//! accepted only within these bounds.
 
 use super::{ActionSignature, Annotations, Catalogue, InvalidAnnotation, Provider, ResourceOffer};
 use crate::expression::parse::parse_expression;
@@ -10,116 +10,116 @@ use crate::resource::{Quantity, ResourceClass};
 use crate::value::{Type, Value};
 use std::collections::BTreeMap;
 
-/// Actions of one worker.
+/// Limit of the actions of one worker.
 const ACTIONS: usize = 128;
-/// Inputs, outputs, outcomes and annotations of one action, together.
+/// Limit of the inputs, outputs, outcomes and annotations of one action, together.
 const PORTS: usize = 128;
-/// Bytes of a name.
+/// Limit of a name, in bytes.
 const NAME_BYTES: usize = 64;
-/// Bytes of a type, a default, an annotation.
+/// Limit of a type, a default or an annotation, in bytes.
 const TEXT_BYTES: usize = 512;
-/// Bytes of a description for people.
+/// Limit of a description for people, in bytes.
 const DESCRIPTION_BYTES: usize = 2_048;
 
-/// See the module.
+/// The description; see the module.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct WorkerDescription {
-    /// The name that tasks use, `inspector` of `inspector/nearest`; empty where it does not say.
+    /// The name that tasks use, `inspector` in `inspector/nearest`; empty if not given.
     pub provider: String,
-    /// The kind of resource that it is; empty where it does not say.
+    /// Its resource kind; empty if not given.
     pub kind: String,
-    /// By name; without a signature where it does not say its ports.
+    /// Its actions by name; without a signature if its ports are not given.
     pub actions: BTreeMap<String, Option<ActionSignature>>,
 }
 
-/// A description that is not believed.
+/// Error: the description is not accepted.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DescriptionError {
-    /// More than anybody needs.
+    /// There are too many of something.
     #[error("it says {count} {what}{of}: at most {most} are taken")]
     TooMany {
-        /// Of what.
+        /// Of what, `actions`.
         what: &'static str,
-        /// Of which action; may be empty.
+        /// The action; may be empty.
         of: String,
-        /// How many.
+        /// Their number.
         count: usize,
-        /// How many are taken.
+        /// The limit.
         most: usize,
     },
-    /// A name that no task could write.
+    /// A name is not allowed in tasks.
     #[error("its {what} `{name}`{of} is no name: {rule}")]
     Name {
-        /// Of what.
+        /// What is named.
         what: &'static str,
-        /// Of which action; may be empty.
+        /// The action; may be empty.
         of: String,
-        /// As it says it, cut.
+        /// The name, shortened.
         name: String,
-        /// What names are like.
+        /// The rule for names.
         rule: &'static str,
     },
-    /// A text that nobody would read.
+    /// A text is too long.
     #[error("its {what}{of} is too long, or not one line of text: at most {most} bytes without control characters")]
     Text {
-        /// Of what.
+        /// Which text.
         what: &'static str,
-        /// Of which action; may be empty.
+        /// The action; may be empty.
         of: String,
-        /// How many are taken.
+        /// The limit, in bytes.
         most: usize,
     },
-    /// The same port twice, or a default of a port that is not optional.
+    /// A port appears twice, or a port that is not optional has a default.
     #[error("action `{action}` says port `{port}` twice, or a default of it that is required")]
     Port {
-        /// Of which action.
+        /// The action.
         action: String,
-        /// Which.
+        /// The port.
         port: String,
     },
-    /// A default that the port would not take.
+    /// A default does not have the port's type.
     #[error("action `{action}`: the default of port `{port}` is `{default}`, which is no {expected}")]
     Default {
-        /// Of which action.
+        /// The action.
         action: String,
-        /// Which.
+        /// The port.
         port: String,
-        /// As it says it, cut.
+        /// The default, shortened.
         default: String,
         /// The port's type.
         expected: Type,
     },
-    /// An annotation that does not read.
+    /// An annotation cannot be parsed.
     #[error("action `{action}`: `{key}: {text}`: {why}")]
     Annotation {
-        /// Of which action.
+        /// The action.
         action: String,
-        /// Under which key.
+        /// Its key.
         key: &'static str,
-        /// As it says it, cut.
+        /// Its text, shortened.
         text: String,
-        /// What is wrong, cut.
+        /// What is wrong, shortened.
         why: String,
     },
-    /// More than is read.
+    /// The message is too large.
     #[error("it has {bytes} bytes: at most {most} are taken")]
     TooLarge {
-        /// On the wire.
+        /// Its size on the wire.
         bytes: usize,
-        /// How many are taken.
+        /// The limit.
         most: usize,
     },
-    /// A type that the grammar does not know.
+    /// The type grammar does not know a type.
     #[error("action `{action}`: port `{port}`: {why}")]
     Type {
-        /// Of which action.
+        /// The action.
         action: String,
-        /// Which.
+        /// The port.
         port: String,
         /// What is wrong.
         why: String,
     },
-    /// The message is none.
+    /// The message cannot be decoded.
     #[error("it cannot be read: {why}")]
     Malformed {
         /// Why.
@@ -128,7 +128,7 @@ pub enum DescriptionError {
 }
 
 impl DescriptionError {
-    /// A default that is not of its port's type.
+    /// The error for a default that does not have its port's type.
     pub fn default_of(action: &str, port: &str, default: &str, expected: &Type) -> DescriptionError {
         DescriptionError::Default {
             action: shown(action),
@@ -140,10 +140,10 @@ impl DescriptionError {
 }
 
 impl WorkerDescription {
-    /// Refuses what is beyond the bounds, by name.
+    /// Checks the description against these bounds.
     ///
     /// # Errors
-    /// [`DescriptionError`] of the first thing that is.
+    /// [`DescriptionError`] for the first violation.
     pub fn check(&self) -> Result<(), DescriptionError> {
         bound("actions", "", self.actions.len(), ACTIONS)?;
         for (what, said) in [("provider", &self.provider), ("kind", &self.kind)] {
@@ -158,14 +158,14 @@ impl WorkerDescription {
         Ok(())
     }
 
-    /// What it describes well enough for a task to use.
+    /// The actions with signatures, which tasks can use.
     pub fn signatures(&self) -> impl Iterator<Item = (&String, &ActionSignature)> {
         self.actions.iter().filter_map(|(name, signature)| Some((name, signature.as_ref()?)))
     }
 }
 
 impl Catalogue {
-    /// Extends it by what a worker of `kind`, of which there can be `count`, says of itself. What is in the catalogue already stays as it is.
+    /// Extends the catalogue by the description of a worker of `kind`, of which there can be `count`. Existing entries do not change.
     pub fn extend_by(&mut self, kind: &str, count: Quantity, worker: &WorkerDescription) {
         if worker.provider.is_empty() || worker.signatures().next().is_none() {
             return;
@@ -221,8 +221,8 @@ fn check(action: &str, signature: &ActionSignature) -> Result<(), DescriptionErr
     })
 }
 
-/// Whether a default as people write it may be of this type. What is no plain constant (a trajectory, a pose with a quaternion) may be anything,
-/// and is not computed: a few characters of somebody else's make a list of a million elements.
+/// Whether a default, as people write it, may have this type. Only plain constants are checked. Others (a trajectory, a pose with a
+/// quaternion) are accepted and not evaluated: a few characters from outside could make a list of a million elements.
 fn may_be(default: &str, expected: &Type) -> bool {
     if matches!(expected, Type::Any | Type::String) {
         return true;
@@ -258,7 +258,7 @@ fn name(what: &'static str, of: &str, said: &str) -> Result<(), DescriptionError
     Err(DescriptionError::Name { what, of: of.to_owned(), name: shown(said), rule })
 }
 
-/// An action's name stands behind a slash and in no expression: it may be any word of a language that others write workers in.
+/// Checks the name of an action. It stands behind a slash and in no expression, so it may be any word that programming languages allow.
 fn action_name(said: &str) -> Result<(), DescriptionError> {
     let good = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
     let begins = said.chars().next().is_some_and(|c| c.is_ascii_alphanumeric() || c == '_');
@@ -274,7 +274,7 @@ fn text(what: &'static str, of: &str, said: &str, most: usize) -> Result<(), Des
     if good { Ok(()) } else { Err(DescriptionError::Text { what, of: of.to_owned(), most }) }
 }
 
-/// What somebody else wrote, as much as a message has room for.
+/// A text from outside, shortened for a message.
 fn shown(said: &str) -> String {
     said.chars().take(NAME_BYTES).map(|c| if c.is_control() { '?' } else { c }).collect()
 }

@@ -1,15 +1,15 @@
-//! Where what a worker says of itself is otherwise than what the catalogue says of it: a task that was checked against the catalogue would
-//! wait for ever, or fail.
+//! Differences between a worker's description of itself and the catalogue's entry for it. A task that was checked against the catalogue
+//! would then wait for ever or fail.
 
 use super::{ActionSignature, Catalogue, WorkerDescription};
 use crate::value::Type;
 use std::collections::BTreeMap;
 
-/// Mismatches of one worker that are told; how many more there are is the last one.
+/// Limit of reported mismatches of one worker; the last entry then gives the number of the others.
 const TOLD: usize = 16;
 
 impl WorkerDescription {
-    /// In which points the catalogue says something else of a worker that is offered as `kind`, each in a sentence.
+    /// The points in which the catalogue differs from a worker that is offered as `kind`, each as a sentence.
     pub fn mismatches(&self, catalogue: &Catalogue, kind: &str) -> Vec<String> {
         let mut found = Vec::new();
         if !self.kind.is_empty() && self.kind != kind {

@@ -1,4 +1,4 @@
-//! Actions against the catalogue: that they exist, and that their ports and outcomes do.
+//! Actions against the catalogue: actions, ports and outcomes must exist there.
 
 use super::Subject;
 use crate::diagnostic::Findings;
@@ -59,7 +59,7 @@ fn outcomes(subject: &Subject<'_>, state: &State, own: &[String], findings: &mut
     if let StateKind::Action { provider, action, .. } = &state.kind
         && (subject.catalogue.action(provider, action).is_none() && !state.is_pause())
     {
-        // Complained of already.
+        // Reported elsewhere.
         return;
     }
     for outcome in state.annotations.effects.keys().filter(|outcome| !own.contains(outcome)) {

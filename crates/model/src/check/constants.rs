@@ -1,4 +1,4 @@
-//! Constants that have no value: what needs neither variables, outputs nor facts is evaluated here and now, as it will be then.
+//! Constant expressions without a value: an expression without variables, outputs and facts is evaluated here as it will be at run time.
 
 use super::{Subject, named};
 use crate::catalogue::JointChain;
@@ -24,13 +24,13 @@ pub(super) fn check(subject: &Subject<'_>, state: &State, slot: Slot<'_>, expr: 
         let message = format!("`{}`: {problem}", named(subject.program, expr));
         findings.error(RULE, subject.place_of(state, slot), &state.path, message, HELP);
     } else if let Some(problem) = joints(subject, state, slot, expr, &Defaults { subject, state }) {
-        // Another value may be given to the run.
+        // A run may set other values.
         let message = format!("`{}`, with what parameters are by default: {problem}", named(subject.program, expr));
         findings.warning(RULE, subject.place_of(state, slot), &state.path, message, HELP_WITH_DEFAULTS);
     }
 }
 
-/// Joint positions of another number than the provider's.
+/// The problem of joint positions whose number differs from the provider's.
 fn joints(subject: &Subject<'_>, state: &State, slot: Slot<'_>, expr: &Expr, scope: &dyn Scope) -> Option<String> {
     let StateKind::Action { provider, .. } = &state.kind else { return None };
     let known = subject.catalogue.providers.get(provider)?;
@@ -49,8 +49,7 @@ fn joints(subject: &Subject<'_>, state: &State, slot: Slot<'_>, expr: &Expr, sco
     })
 }
 
-/// The parameters of the task in a state, as they are where the run is given no others: those that nothing assigns to, and that are not hidden by a
-/// variable of the same name.
+/// The scope of a state with the defaults of the task's parameters, except parameters that are assigned or hidden by a variable of the same name.
 struct Defaults<'a> {
     subject: &'a Subject<'a>,
     state: &'a State,
@@ -66,7 +65,6 @@ impl Scope for Defaults<'_> {
     }
 }
 
-/// Whether a state has a variable of this name.
 fn binds(state: &State, name: &str) -> bool {
     let of_loop = match &state.kind {
         StateKind::ForEach { variable, index, .. } => variable == name || index.as_deref() == Some(name),
@@ -75,8 +73,8 @@ fn binds(state: &State, name: &str) -> bool {
     of_loop || state.variables.iter().any(|(own, _)| own == name)
 }
 
-/// What is wrong with the first part that is a constant and has no value. A part that may be passed over (the branches of an `if`, the
-/// right of `and` and `or`) does not count unless the whole is a constant.
+/// The error of the first constant part without a value. Parts that may be skipped (the branches of an `if`, the right side of `and` and `or`)
+/// count only if the whole expression is constant.
 pub(crate) fn problem(expr: &Expr) -> Option<EvaluateError> {
     match expr.evaluate(&NothingKnown) {
         Ok(_) => None,
@@ -85,7 +83,7 @@ pub(crate) fn problem(expr: &Expr) -> Option<EvaluateError> {
     }
 }
 
-/// The parts that are evaluated whenever the whole is.
+/// The parts that are always evaluated with the whole.
 fn parts(expr: &Expr) -> Vec<&Expr> {
     use crate::expression::BinaryOperator::{And, Or};
     match expr {
@@ -95,14 +93,14 @@ fn parts(expr: &Expr) -> Vec<&Expr> {
         | Expr::Port { .. }
         | Expr::Unknown(_)
         | Expr::Element(_) => Vec::new(),
-        // Its body is evaluated for no element of an empty list.
+        // The body is not evaluated if the list is empty.
         Expr::Each { list, .. } => vec![list],
-        // What is not looked at when an earlier condition fails.
+        // Later conditions are not evaluated if an earlier one fails.
         Expr::Query(_) | Expr::Find(..) => Vec::new(),
         Expr::Field(of, _) | Expr::Unary(_, of) | Expr::Binary(And | Or, of, _) => vec![of],
         Expr::Index(a, b) | Expr::Binary(_, a, b) => vec![a, b],
         Expr::Call(Function::If, arguments) => arguments.iter().take(1).collect(),
-        // Which of them is evaluated is known only while the task runs.
+        // Which argument is evaluated is known only at run time.
         Expr::Call(Function::Either, _) => Vec::new(),
         Expr::List(items) | Expr::Call(_, items) => items.iter().collect(),
         Expr::Map(fields) => fields.iter().map(|(_, item)| item).collect(),

@@ -1,13 +1,13 @@
-//! Requests that can never be granted: what would have to be had together and cannot be, and waits that go in circles.
+//! Requests that can never be granted: resources that cannot be held together, and circular waits.
 //!
-//! A node asks once, for all it needs, and holds nothing while it waits (an action its own blocks and those of what is around
-//! it, a routine also those of what it contains); so holders never wait for each other. What remains are two ways to wait for ever:
+//! A node acquires everything it needs at once, and holds nothing while it waits (an action: its own blocks and those of the states
+//! around it; a routine: also those of its parts). So holders never wait for each other. Two ways to wait for ever remain:
 //!
-//! - one request names more of a kind than the system can have, because what is around a state blocks others than it does itself;
-//! - a task resource is created only behind states that wait for it, themselves or by way of others.
+//! - one request needs more of a kind than the system can have, because states around a state block other units than the state itself;
+//! - a task resource is created only behind states that wait for it, directly or through others.
 //!
-//! The second is found over the control flow: whatever may be created is, as soon as anything may come to its creator; the states that
-//! are reached and whose kind nothing has created by then wait for ever.
+//! The second is found in the control flow: a resource counts as created as soon as the control flow can reach its creator. States
+//! that are reached, but wait for a kind that nothing has created by then, wait for ever.
 
 use super::Subject;
 use super::graph::{ControlFlow, Point};
@@ -26,7 +26,7 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     waits(subject, findings);
 }
 
-/// What asks the resource manager: the outermost of actions and routines.
+/// The states that acquire resources: the outermost actions and routines.
 fn nodes(program: &Program) -> Vec<&State> {
     let (mut nodes, mut open) = (Vec::new(), vec![Program::ROOT]);
     while let Some(id) = open.pop() {
@@ -40,7 +40,7 @@ fn nodes(program: &Program) -> Vec<&State> {
     nodes
 }
 
-/// The lines of one request with the states that say them: what the node contains, and the blocks around it.
+/// The resource lines of one request, each with its state: those of the node's parts, and the blocks around it.
 fn lines<'a>(subject: &Subject<'a>, node: &'a State) -> Vec<(&'a State, &'a ResourceExpr)> {
     let mut lines = Vec::new();
     let mut open = vec![node];
@@ -62,7 +62,7 @@ fn lines<'a>(subject: &Subject<'a>, node: &'a State) -> Vec<(&'a State, &'a Reso
     lines
 }
 
-/// Blocks of the same attributes are one; of others they are others, and all are asked for at once.
+/// Blocks with the same attributes merge; blocks with different attributes are acquired together.
 fn too_many_together(subject: &Subject<'_>, node: &State, findings: &mut Findings) {
     let mut wanted = BTreeMap::<&str, Vec<(&State, &ResourceExpr)>>::new();
     for (state, line) in lines(subject, node) {
@@ -80,7 +80,7 @@ fn too_many_together(subject: &Subject<'_>, node: &State, findings: &mut Finding
         let Some(offer) = subject.catalogue.resources.get(kind) else { continue };
         let count = parts.iter().map(|(_, line)| line.count).sum::<Quantity>();
         let states: BTreeSet<StateId> = parts.iter().map(|(state, _)| state.id).collect();
-        // What one state asks for alone is another rule's.
+        // What a single state requires is checked by another rule.
         if count <= offer.count || states.len() < 2 {
             continue;
         }
@@ -110,7 +110,7 @@ fn path(state: &State) -> String {
     if state.path.is_empty() { "the task".to_owned() } else { format!("`{}`", state.path) }
 }
 
-/// A state that has to wait for what only the task creates.
+/// A state that waits for a resource that only the task creates.
 struct Waiting<'a> {
     node: &'a State,
     says: &'a State,
@@ -137,7 +137,7 @@ fn waits(subject: &Subject<'_>, findings: &mut Findings) {
             gates.entry(node.id).or_default().push(Waiting { node, says, line });
         }
     }
-    // A kind that nothing creates has been complained of already.
+    // A kind that nothing creates is reported elsewhere.
     let mut created: BTreeSet<&str> = by_kind.iter().filter(|(_, c)| c.is_empty()).map(|(kind, _)| *kind).collect();
     if gates.is_empty() {
         return;
@@ -166,7 +166,7 @@ fn waits(subject: &Subject<'_>, findings: &mut Findings) {
     }
 }
 
-/// Whether a state can end before it asks for anything.
+/// Whether a state can end before it acquires anything.
 fn may_fail_first(state: &State) -> bool {
     !state.annotations.requires.is_empty()
         || state.annotations.resources.iter().any(|line| line.expressions().next().is_some())
@@ -177,7 +177,7 @@ fn has_ended(control: &ControlFlow, reached: &[bool], state: &State) -> bool {
     of.iter().position(|o| o == SUCCESS).is_some_and(|n| control.is_in(reached, Point::End(state.id, n)))
 }
 
-/// Who waits for what, from one state on until one comes again.
+/// The circle of waits from one state on until a state repeats.
 fn circle(
     subject: &Subject<'_>,
     first: &Waiting<'_>,

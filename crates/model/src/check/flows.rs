@@ -1,7 +1,7 @@
-//! Data flows that no order of execution can serve: from a state that comes later, contains this one, or may not have run.
+//! Data flows that no order of execution can satisfy: the source comes later, contains the target, or may not have run.
 //!
-//! Whether an output is there is read from the control flow ([`super::graph`]). The flows of the whole program form a graph, too
-//! (petgraph): it tells a flow that reordering would repair from a cycle.
+//! Whether an output exists is derived from the control flow ([`super::graph`]). All flows together form another graph (petgraph), which
+//! distinguishes a flow that reordering would repair from a cycle.
 
 use super::graph::{ControlFlow, Point, decided, one_succeeds};
 use super::ways::{Flow, ways};
@@ -31,10 +31,10 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     }
 }
 
-/// What is wrong with a flow: the rule, the message, what to do.
+/// A refused flow: the rule, the message, what to do.
 type Refused = (&'static str, String, String);
 
-/// Why an output of the state itself cannot be used where it has ended.
+/// The violation if the state's own output may be missing when it ends.
 fn left_out(subject: &Subject<'_>, to: &State, slot: Slot<'_>, expr: &Expr) -> Option<Refused> {
     let control = subject.control;
     let only = match slot {
@@ -60,7 +60,7 @@ fn left_out(subject: &Subject<'_>, to: &State, slot: Slot<'_>, expr: &Expr) -> O
     Some(("branch-may-not-have-written", message, "give the output a default".to_owned()))
 }
 
-/// Why an output cannot be used in an expression; one of several of which the first that is there is taken need not be there on every way.
+/// The violation by an output in an expression. `is_one_of_several`: it is an argument of `either`, so it need not exist on every path.
 fn refused(
     subject: &Subject<'_>,
     graph: &FlowGraph,
@@ -74,7 +74,7 @@ fn refused(
     let maybe = may_be_written(subject.control, to, slot, (from, port));
     let relation = relation(subject, to, slot, source);
     if !matches!(relation, Relation::Hidden(_) | Relation::Beside) {
-        // What a state contains is forgotten when it is entered, also where it is one of several that may be there.
+        // Outputs inside of a state are removed when the state is entered, so they are missing even as one of several.
         let is_forgotten = matches!(relation, Relation::Inside);
         if is_there(subject, to, slot, (from, port)) || (maybe && is_one_of_several && !is_forgotten) {
             return None;
@@ -87,7 +87,7 @@ fn refused(
         }
     }
     let (rule, message, help) = match relation {
-        // A run that begins behind the state that writes it.
+        // The run begins behind the state that writes the output.
         Relation::Before
             if subject.begins_elsewhere && !is_one_of_several && subject.control.is_reached(Point::Begin(to.id)) =>
         {
@@ -138,7 +138,7 @@ fn refused(
     Some((rule, message, help))
 }
 
-/// How the source of a flow lies to its target in the program.
+/// Where the source of a flow is, seen from its target.
 enum Relation<'a> {
     Before,
     Beside,
@@ -153,7 +153,7 @@ enum Relation<'a> {
 
 fn relation<'a>(subject: &Subject<'a>, to: &State, slot: Slot<'_>, from: &'a State) -> Relation<'a> {
     let up: Vec<&'a State> = subject.around(to.id).collect();
-    // What is inside of a pass is inside of its loop.
+    // A state put around a loop's body (`is_pass`) does not count.
     let is_between = |state: &&State| subject.program.is_pass(state.id) && !up.iter().any(|other| other.id == state.id);
     let down: Vec<&'a State> = subject.around(from.id).filter(|state| !is_between(state)).collect();
     if from.id == to.id {
@@ -162,7 +162,7 @@ fn relation<'a>(subject: &Subject<'a>, to: &State, slot: Slot<'_>, from: &'a Sta
     if up.iter().any(|state| state.id == from.id) {
         return Relation::Around;
     }
-    // The innermost state that contains both (or is the target), and its child on the source's side.
+    // The innermost state that contains both (or is the target), and the source-side child of it.
     let Some(depth) = down.iter().position(|state| up.iter().any(|other| other.id == state.id)) else {
         return Relation::After;
     };
@@ -188,7 +188,7 @@ fn relation<'a>(subject: &Subject<'a>, to: &State, slot: Slot<'_>, from: &'a Sta
             _ => return Relation::After,
         }
     }
-    // From the child down to the source: only what surely runs, and lets its outputs out.
+    // From that child down to the source, every state must always run and make its outputs visible.
     for container in down[..depth].iter().skip(1).rev() {
         match container.kind {
             StateKind::ForEach { .. } | StateKind::While { .. } | StateKind::Condition { .. } => {
@@ -200,12 +200,12 @@ fn relation<'a>(subject: &Subject<'a>, to: &State, slot: Slot<'_>, from: &'a Sta
     if depth > 1 { Relation::Hidden(side) } else { Relation::Before }
 }
 
-/// Whether the source has surely written its outputs when the expression of the target is evaluated.
+/// Whether the source has certainly written its outputs when the target's expression is evaluated.
 fn is_written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: Flow<'_>) -> bool {
     points(control, to, slot).into_iter().all(|point| control.written(point, from).0)
 }
 
-/// Whether it may have: what an output is made of also where the state is left by an outcome of its own.
+/// Whether it may have written them. For an output this includes the ends by the state's own outcomes.
 fn may_be_written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: Flow<'_>) -> bool {
     let mut all = points(control, to, slot);
     if matches!(slot, Slot::Output(_)) {
@@ -214,7 +214,7 @@ fn may_be_written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: Flow<
     all.into_iter().any(|point| control.written(point, from).1)
 }
 
-/// Where the expression of the target is evaluated.
+/// The points at which the target's expression is evaluated.
 fn points(control: &ControlFlow, to: &State, slot: Slot<'_>) -> Vec<Point> {
     let in_the_middle = match slot {
         Slot::Decide(_) | Slot::While => true,
@@ -227,7 +227,7 @@ fn points(control: &ControlFlow, to: &State, slot: Slot<'_>) -> Vec<Point> {
     if matches!(to.kind, StateKind::Action { .. }) || !is_at_end(slot) {
         return vec![Point::Begin(to.id)];
     }
-    // What an output is made of may be missing where the state is left by an outcome of its own; then it is not written.
+    // At the end by an outcome of its own, a state leaves out an output whose inputs are missing.
     let only = match slot {
         Slot::Effect(outcome) => Some(outcome),
         Slot::Output(_) => Some(SUCCESS),
@@ -254,7 +254,7 @@ fn at_join(to: &State, slot: Slot<'_>) -> bool {
         && matches!(slot, Slot::Decide(_) | Slot::Output(_) | Slot::Effect(_))
 }
 
-/// Why outputs of which the first that is there is taken cannot be used.
+/// The violations by an `either`, whose first available argument is taken.
 fn none_refused(
     subject: &Subject<'_>,
     graph: &FlowGraph,
@@ -266,7 +266,7 @@ fn none_refused(
     if !each.is_empty() || either.iter().any(|way| way.iter().all(|flow| is_there(subject, to, slot, *flow))) {
         return each;
     }
-    // Of a way that needs several outputs nothing is said: that one is there does not say that the others are.
+    // An argument with several outputs is ignored here: one of them may exist without the others.
     let of_one: BTreeSet<Flow<'_>> = either.iter().filter_map(|way| subject.control.one_of(way)).collect();
     let from: BTreeSet<StateId> = of_one.iter().map(|(from, _)| *from).collect();
     let is_covered = match join(subject, to, slot, &from) {
@@ -287,7 +287,7 @@ fn none_refused(
     vec![("branch-may-not-have-written", message, help.to_owned())]
 }
 
-/// Whether an output is surely there: written on every way, or with a default.
+/// Whether an output certainly exists: it is written on every path, or has a default.
 fn is_there(subject: &Subject<'_>, to: &State, slot: Slot<'_>, (from, port): Flow<'_>) -> bool {
     let source = subject.program.state(from);
     source.defaults.contains_key(port)
@@ -300,8 +300,8 @@ fn is_region_of(to: &State, from: StateId) -> bool {
     matches!(&to.kind, StateKind::Concurrency { regions, .. } if regions.contains(&from))
 }
 
-/// Whether one of these regions has surely written its outputs when the concurrency has ended with success, as far as it is known; `None` if it
-/// is not about regions.
+/// Whether one of these regions has certainly written its outputs when the concurrency ends with success, as far as it is known; `None` if the
+/// flow is not from a region.
 fn join(subject: &Subject<'_>, to: &State, slot: Slot<'_>, from: &BTreeSet<StateId>) -> Option<bool> {
     let StateKind::Concurrency { regions, preemptive, successes, .. } = &to.kind else { return None };
     let ours = regions.iter().filter(|region| from.contains(region)).count();
@@ -309,7 +309,7 @@ fn join(subject: &Subject<'_>, to: &State, slot: Slot<'_>, from: &BTreeSet<State
         return None;
     }
     let watches = regions.iter().filter(|region| subject.program.state(**region).is_watch()).count();
-    // What is decided by the outcomes is up to who wrote that, and so is what an outcome changes.
+    // The author of a decider or an effect is responsible for the outcomes.
     if !matches!(slot, Slot::Output(_)) {
         return Some(true);
     }
@@ -339,7 +339,7 @@ fn node(id: StateId) -> NodeIndex {
     NodeIndex::new(usize::try_from(id.0).unwrap_or(usize::MAX))
 }
 
-/// The way along the flows from one state to the other, if there is one, back to the first.
+/// The path along the flows from one state to the other and back to the first, if there is one.
 fn cycle(program: &Program, graph: &FlowGraph, from: StateId, to: StateId) -> Option<String> {
     let goal = node(to);
     let (_, way) = petgraph::algo::astar(graph, node(from), |n| n == goal, |_| 1_u32, |_| 0)?;

@@ -1,6 +1,6 @@
-//! Functions that are not there. Predicates need no declaration, so `graps_pose($box)` reads as the value of a fact; where nothing in
-//! the task says that there is such a fact and a function is called almost so, it is meant; and a fact that nothing writes or declares
-//! is told of, since it is null wherever it is read.
+//! Unknown functions. Predicates need no declaration, so `graps_pose($box)` parses as the value of a fact. If the task never mentions
+//! such a fact and a function has a similar name, the function is meant. A fact that nothing writes or declares is reported, because
+//! it is null wherever it is read.
 
 use super::types::Wrong;
 use super::{Subject, expressions, named};
@@ -11,13 +11,13 @@ use crate::slot::Slot;
 use crate::value::Type;
 use std::collections::BTreeSet;
 
-/// So long a name may differ in two letters, a shorter one in one.
+/// From this length on a name may differ in two letters, a shorter one in one.
 const LONG_NAME: usize = 8;
-/// So short a function's name is close to too many words to refuse one.
+/// Short names are similar to too many words; they cause only a warning.
 const SHORT_NAME: usize = 3;
 
-/// Functions of other languages that people write, and what does the same here: none of them is here, and no task has facts of such
-/// names unless it says so.
+/// Functions of other languages that people write, with their replacement here. None of them exists here, and no task has facts with
+/// these names unless it declares them.
 const OF_OTHER_LANGUAGES: [(&str, &str); 36] = [
     ("acos", ""),
     ("asin", ""),
@@ -57,7 +57,7 @@ const OF_OTHER_LANGUAGES: [(&str, &str); 36] = [
     ("zip", ""),
 ];
 
-/// Why a fact that is about what no fact can be about is a function that is not there.
+/// The error that a fact with an impossible argument is an unknown function.
 pub(super) fn no_fact(subject: &Subject<'_>, fact: &FactExpr, about: &Type) -> Wrong {
     let name = fact.predicate.as_str();
     let whole = named(subject.program, &Expr::Fact(fact.clone()));
@@ -73,7 +73,7 @@ pub(super) fn no_fact(subject: &Subject<'_>, fact: &FactExpr, about: &Type) -> W
     Wrong { rule: "unknown-function", message, help }
 }
 
-/// What does here what a function of another language does; empty where nothing does.
+/// The replacement of a function of another language; empty if there is none.
 fn elsewhere(name: &str) -> Option<&'static str> {
     OF_OTHER_LANGUAGES.iter().find(|(other, _)| *other == name).map(|(_, here)| *here)
 }
@@ -86,7 +86,7 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     for state in &program.states {
         for (slot, expr) in expressions(program, state) {
             let at = subject.place_of(state, slot);
-            // One is refused already, for what it is about.
+            // Already reported for its argument.
             if findings.has("unknown-function", at) {
                 continue;
             }
@@ -117,11 +117,11 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
                         let help = format!("there is no function `{name}`: {instead}. If it is a fact, {declare}");
                         findings.error("unknown-function", at, &state.path, message, help);
                     }
-                    // `unestablished-precondition` says it.
+                    // Reported by `unestablished-precondition`.
                     (None, None) if matches!(slot, Slot::Requires(_)) => {}
-                    // Somebody else is to write it.
+                    // The task waits for it, so somebody else writes it.
                     (None, None) if awaited.contains(name) => {}
-                    // Once each: what nobody writes is null wherever it is read.
+                    // Reported once per name: a fact that nothing writes is null wherever it is read.
                     (None, near) if told.insert(name.to_owned()) => {
                         let help = match near {
                             Some(near) => {
@@ -139,7 +139,7 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     deleted(subject, findings);
 }
 
-/// A fact that is deleted, which nothing writes, and which is called almost like one that something does write.
+/// Reports facts that are deleted but never written, if the name of a written fact is similar.
 fn deleted(subject: &Subject<'_>, findings: &mut Findings) {
     let known = mentioned(subject, true);
     for state in &subject.program.states {
@@ -160,20 +160,20 @@ fn deleted(subject: &Subject<'_>, findings: &mut Findings) {
     }
 }
 
-/// The predicate that is meant by a name that nothing in the task writes or declares, where one is called almost so.
+/// The predicate with a similar name, for a name that nothing in the task writes or declares.
 pub(super) fn meant_predicate<'a>(subject: &Subject<'a>, name: &str) -> Option<&'a str> {
     let known = predicates(subject);
     if known.contains(name) { None } else { nearest(name, &known) }
 }
 
-/// The predicate that a name is almost the name of.
+/// The predicate with the most similar name.
 fn nearest<'a>(name: &str, known: &BTreeSet<&'a str>) -> Option<&'a str> {
     let allowed = if name.len() >= LONG_NAME { 2 } else { 1 };
     let near = known.iter().map(|other| (edits(name, other), *other)).min_by_key(|(edits, _)| *edits)?;
     (near.0 <= allowed).then_some(near.1)
 }
 
-/// The function that a name is almost the name of, how it is called, and whether so many arguments fit.
+/// The function with the most similar name, its usage, and whether it takes this number of arguments.
 fn meant<'o>(
     predicate: &str,
     arguments: usize,
@@ -189,7 +189,7 @@ fn meant<'o>(
     (near.0 <= allowed).then_some(near.1)
 }
 
-/// Edits between two names; two neighbours in the wrong order are one.
+/// Edit distance of two names; swapping two neighbours counts as one edit.
 fn edits(a: &str, b: &str) -> usize {
     let plain = distance(a, b);
     let differ: Vec<usize> =
@@ -200,19 +200,19 @@ fn edits(a: &str, b: &str) -> usize {
     }
 }
 
-/// The predicates that the task says there are: what it writes, reads by declaration, senses, asks for with `?` or holds at the start.
+/// The predicates that the task mentions: those that it writes, declares in `reads`, senses, looks up with `?`, or sets at the start.
 fn predicates<'a>(subject: &Subject<'a>) -> BTreeSet<&'a str> {
     mentioned(subject, false)
 }
 
-/// The predicates that states wait for: that a task waits for a fact says that somebody else writes it.
+/// The predicates in conditions of waits: whoever waits for a fact expects somebody else to write it.
 fn awaited<'a>(subject: &Subject<'a>) -> BTreeSet<&'a str> {
     let waits = subject.program.states.iter().filter(|state| state.is_pause());
     let expressions = waits.flat_map(|state| expressions(subject.program, state));
     expressions.flat_map(|(_, expr)| expr.fact_expressions()).map(|fact| fact.predicate.as_str()).collect()
 }
 
-/// The same; where only `made` count, without those that are only deleted.
+/// The predicates that the task mentions; with `made`, facts that are only deleted do not count.
 fn mentioned<'a>(subject: &Subject<'a>, made: bool) -> BTreeSet<&'a str> {
     let program = subject.program;
     let mut known = BTreeSet::new();
@@ -224,7 +224,7 @@ fn mentioned<'a>(subject: &Subject<'a>, made: bool) -> BTreeSet<&'a str> {
     known.extend(program.initial.iter().flat_map(written));
     for state in &program.states {
         let annotations = &state.annotations;
-        // What a wait foresees it does not do: a letter may be wrong in it.
+        // Effects that a wait foresees do not count: their names may be misspelled.
         let effects = annotations.effects.values().filter(|_| !state.is_pause());
         known.extend(effects.flatten().flat_map(written));
         let named = annotations.reads.iter().flatten().chain(annotations.senses());

@@ -1,8 +1,8 @@
-//! The control flow of a program as a graph: where each state begins and how it ends, and what leads where.
+//! The control flow of a program as a graph: points where states begin and end, and edges between them.
 //!
-//! Two facts are computed over it for every point: which states have surely written their outputs by then, and which may
-//! have. A state inside of a composite is forgotten when the composite is entered again. Where a state is left by an outcome of its own, what an
-//! output is made of may not have been written; so such an output ([`Ports`]) counts for itself.
+//! For every point it computes which states have certainly written their outputs by then, and which may have (definite assignment). A state inside of
+//! a composite state is removed from both when the composite is entered again. If a state is left by an outcome of its own, an output's inputs may not
+//! have been written; such outputs ([`Ports`]) are tracked separately.
 
 use super::ways::{Flow, Ways, ways};
 use crate::expression::{BinaryOperator, Expr};
@@ -18,9 +18,9 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 pub(crate) enum Point {
     /// A state is visited.
     Begin(StateId),
-    /// A loop looks at its list or predicate; all regions of a concurrency have ended.
+    /// A loop evaluates its list or predicate; or all regions of a concurrency have ended.
     Middle(StateId),
-    /// A state has ended by its outcome of this number.
+    /// A state has ended by the outcome of this number.
     End(StateId, usize),
 }
 
@@ -30,12 +30,12 @@ pub(crate) struct ControlFlow {
     places: BTreeMap<Point, NodeIndex>,
     outcomes: Vec<Vec<String>>,
     ports: Ports,
-    /// By place; `None` where nothing leads.
+    /// By point; `None` if no path leads there.
     surely: Vec<Option<Set>>,
     maybe: Vec<Set>,
 }
 
-/// The outputs that a state may leave out where it ends by an outcome of its own.
+/// The outputs that a state may leave out when it ends by an outcome of its own.
 #[derive(Debug, Default)]
 struct Ports {
     of: BTreeMap<StateId, Vec<Port>>,
@@ -46,12 +46,12 @@ struct Port {
     name: String,
     /// Its number in a [`Set`].
     number: usize,
-    /// The outcomes with which it may be left out.
+    /// The outcomes with which it may be missing.
     left_out: BTreeSet<usize>,
 }
 
 impl Ports {
-    /// Before it is known with which outcomes they are there, they are with every one.
+    /// All such outputs; at first none is assumed to be missing with any outcome.
     fn of(program: &Program, outcomes: &[Vec<String>]) -> Ports {
         let mut number = program.states.len();
         let mut of: BTreeMap<StateId, Vec<Port>> = BTreeMap::new();
@@ -75,7 +75,7 @@ impl Ports {
     }
 }
 
-/// A set of states, and of outputs that count for themselves.
+/// A set of states and of separately tracked outputs.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Set(Vec<u64>);
 
@@ -102,7 +102,6 @@ impl Set {
 }
 
 impl ControlFlow {
-    /// The control flow of a program.
     pub(crate) fn of(program: &Program) -> ControlFlow {
         let outcomes = program.all_outcomes();
         let ports = Ports::of(program, &outcomes);
@@ -118,7 +117,7 @@ impl ControlFlow {
         for state in &program.states {
             let id = state.id;
             let begin = Point::Begin(id);
-            // What a state is made of may fail at once.
+            // An expression of the state may fail at once.
             flow.lead(begin, flow.end(id, ABORTED));
             let first = |list: &[StateId], flow: &ControlFlow| match list.first() {
                 Some(first) => Point::Begin(*first),
@@ -165,20 +164,20 @@ impl ControlFlow {
             }
         }
         flow.solve(program);
-        // An output that is left out may be what another one is made of.
+        // An output may depend on another one that may be missing.
         while flow.leave_out(program) {
             flow.solve(program);
         }
         flow
     }
 
-    /// Whether something leads to a point from the beginning of the task.
+    /// Whether a path leads from the beginning of the task to a point.
     pub(crate) fn is_reached(&self, point: Point) -> bool {
         self.places.get(&point).is_some_and(|place| self.surely[place.index()].is_some())
     }
 
-    /// Whether the state has surely, and whether it may have, written an output when the control flow comes to a point. Of a point that
-    /// nothing leads to everything is sure.
+    /// Whether the state has certainly written an output when the control flow reaches a point, and whether it may have. At an unreachable point
+    /// everything counts as certain.
     pub(crate) fn written(&self, point: Point, (state, port): Flow<'_>) -> (bool, bool) {
         let Some(place) = self.places.get(&point) else { return (true, true) };
         let member = self.ports.get(state, port).map_or(index(state), |port| port.number);
@@ -188,15 +187,14 @@ impl ControlFlow {
         }
     }
 
-    /// Whether a state that ends by an outcome has surely written an output.
+    /// Whether a state that ends by this outcome has certainly written an output.
     pub(crate) fn gives(&self, (state, port): Flow<'_>, outcome: &str) -> bool {
         let number = self.outcomes[index(state)].iter().position(|known| known == outcome);
         let left_out = self.ports.get(state, port).zip(number).is_some_and(|(port, n)| port.left_out.contains(&n));
         !is_failure(outcome) && !left_out
     }
 
-    /// An output that is there where all of these are, which are a way of an `either`, and not there where one of them is not. `None` where that is
-    /// not one.
+    /// For one argument of an `either`: the single output that exists exactly if all outputs of the argument exist. `None` if there is no such output.
     pub(crate) fn one_of<'e>(&self, way: &BTreeSet<Flow<'e>>) -> Option<Flow<'e>> {
         let first = way.first()?;
         let is_left_out =
@@ -206,8 +204,8 @@ impl ControlFlow {
         (way.iter().all(|(state, _)| *state == first.0) && left_out.next().is_none()).then_some(*one)
     }
 
-    /// Whether one of these outputs has been written, whichever way the control flow came to a point. Where it comes to a state around one of them,
-    /// or begins an iteration of a loop that goes through one of them, that one is forgotten, and then none is sure.
+    /// Whether one of these outputs has been written on every path to a point. When the control flow enters a state around one of them, or begins an
+    /// iteration of a loop that contains it, the output is removed, and then none is certain.
     pub(crate) fn one_is_written(&self, program: &Program, point: Point, flows: &BTreeSet<Flow<'_>>) -> bool {
         let (Some(begin), Some(goal)) = (self.places.get(&Point::Begin(Program::ROOT)), self.places.get(&point)) else {
             return true;
@@ -218,7 +216,7 @@ impl ControlFlow {
         let iterated = flows.iter().filter_map(|(id, _)| parent(id)).filter(|id| program.is_iterated(*id));
         let iterated: BTreeSet<StateId> =
             iterated.filter_map(|id| if passes.contains(&id) { parent(&id) } else { Some(id) }).collect();
-        // What may be left out where its state ends once more is told apart from the others, as far as there is room.
+        // Outputs that a further end of their state may leave out get a bit each, up to a limit.
         let may_be_left_out: Vec<Flow<'_>> = flows
             .iter()
             .filter(|(id, port)| self.ports.get(*id, port).is_some_and(|port| !port.left_out.is_empty()))
@@ -226,7 +224,7 @@ impl ControlFlow {
             .take(6)
             .collect();
         let bit_of = |flow: &Flow<'_>| may_be_left_out.iter().position(|other| other == flow).map_or(0, |n| n + 1);
-        // Per place: with which of them it was come to.
+        // By point, the combinations of outputs with which it was reached.
         let mut seen = vec![0_u128; self.graph.node_count()];
         let mut open = vec![(*begin, 0_u8)];
         while let Some((place, mut written)) = open.pop() {
@@ -259,12 +257,11 @@ impl ControlFlow {
         seen[goal.index()] & 1 == 0
     }
 
-    /// The outcomes of a state.
     pub(crate) fn outcomes(&self, id: StateId) -> &[String] {
         &self.outcomes[id.0 as usize]
     }
 
-    /// The points from which no end of the task can be reached, although they are reached themselves.
+    /// The reachable points from which no end of the task can be reached.
     pub(crate) fn dead_ends(&self) -> Vec<Point> {
         let mut seen = vec![false; self.graph.node_count()];
         let mut open: Vec<NodeIndex> = Vec::new();
@@ -283,8 +280,8 @@ impl ControlFlow {
         dead.map(|place| self.graph[place]).collect()
     }
 
-    /// What can be reached if only some states may begin. Any other ends at once, `aborted`, where it may fail before, and else
-    /// goes nowhere; the regions of a barrier are all waited for. By place: see [`ControlFlow::is_in`].
+    /// The points that can be reached if only some states may begin. Any other state ends at once with `aborted` if it may fail before, else it
+    /// blocks. A barrier waits for all its regions. The result is by point; see [`ControlFlow::is_in`].
     pub(crate) fn reached_when(
         &self,
         program: &Program,
@@ -322,12 +319,12 @@ impl ControlFlow {
         reached
     }
 
-    /// Whether a point is among those that were reached.
+    /// Whether a point is in such a result.
     pub(crate) fn is_in(&self, reached: &[bool], point: Point) -> bool {
         self.places.get(&point).is_some_and(|place| reached[place.index()])
     }
 
-    /// Whether the control flow may come from one point to another.
+    /// Whether a path leads from one point to another.
     pub(crate) fn leads_to(&self, from: Point, to: Point) -> bool {
         match (self.places.get(&from), self.places.get(&to)) {
             (Some(from), Some(to)) => petgraph::algo::has_path_connecting(&self.graph, *from, *to, None),
@@ -341,7 +338,7 @@ impl ControlFlow {
         Point::End(id, number)
     }
 
-    /// Where a list leads that ends by an outcome.
+    /// The next point when a list ends by an outcome.
     fn leave(&self, program: &Program, parent: StateId, by: &str) -> Point {
         match &program.state(parent).kind {
             StateKind::ForEach { .. } | StateKind::While { .. } if by == SUCCESS => Point::Middle(parent),
@@ -364,7 +361,7 @@ impl ControlFlow {
         self.graph.add_edge(from, to, ());
     }
 
-    /// Finds with which outcomes outputs may be left out, as far as it is known what is written by then; whether that is news.
+    /// Updates the outcomes with which outputs may be missing, from what is known to be written; true if anything changed.
     fn leave_out(&mut self, program: &Program) -> bool {
         let mut news: Vec<(StateId, usize, usize)> = Vec::new();
         for (id, ports) in &self.ports.of {
@@ -391,7 +388,7 @@ impl ControlFlow {
         !news.is_empty()
     }
 
-    /// Whether all that an expression needs has surely been written when the control flow comes to the end of a state by an outcome, or has a default.
+    /// Whether all inputs of an expression certainly exist, or have defaults, when a state ends by an outcome.
     fn are_there(&self, program: &Program, (point, outcome): (Point, &str), ways: &Ways<'_>) -> bool {
         let is_there = |(state, port): &Flow<'_>| {
             let state = program.state(*state);
@@ -401,7 +398,7 @@ impl ControlFlow {
                 Some(around) if decided(around, outcome).is_some() => {
                     decided(around, outcome).is_some_and(|holds| one_succeeds(holds, &BTreeSet::from([state.id])))
                 }
-                // It ends as the one region does that is no watch.
+                // With watches beside it, this region alone decides.
                 Some(around) => {
                     let mut others = around.children().filter(|id| *id != state.id);
                     !others.all(|other| program.state(other).is_watch()) || self.gives((state.id, port), outcome)
@@ -417,7 +414,7 @@ impl ControlFlow {
         ways.needed.iter().all(is_there) && ways.either.iter().all(one_is_there)
     }
 
-    /// Definite assignment, forwards to a fixed point.
+    /// Definite assignment, as a forward fixed point.
     fn solve(&mut self, program: &Program) {
         let states = program.states.len() + self.ports.count();
         let inside: Vec<Vec<StateId>> = program.states.iter().map(|state| contained(program, state.id)).collect();
@@ -473,13 +470,13 @@ impl ControlFlow {
     }
 }
 
-/// When the decider of a concurrency says this outcome; `None` where it does not speak of it.
+/// The decider's boolean for this outcome; `None` if the decider does not mention it.
 pub(super) fn decided<'p>(state: &'p State, outcome: &str) -> Option<&'p Expr> {
     let StateKind::Concurrency { decide, .. } = &state.kind else { return None };
     decide.iter().find(|(decided, _)| decided == outcome).map(|(_, holds)| holds)
 }
 
-/// Whether one of these regions has surely ended with success where this holds: as far as it says so outright.
+/// Whether one of these regions has certainly ended with success if this expression is true, as far as it states that literally.
 pub(super) fn one_succeeds(holds: &Expr, regions: &BTreeSet<StateId>) -> bool {
     let is_success = |a: &Expr, b: &Expr| match (a, b) {
         (Expr::Port { state, port }, Expr::Literal(Value::String(outcome))) => {
@@ -495,7 +492,7 @@ pub(super) fn one_succeeds(holds: &Expr, regions: &BTreeSet<StateId>) -> bool {
     }
 }
 
-/// Whether an outcome gives outputs, and is not success.
+/// Whether the outcome gives outputs and is not success.
 fn is_own(outcome: &str) -> bool {
     outcome != SUCCESS && !is_failure(outcome)
 }

@@ -1,5 +1,5 @@
-//! Facts that the task's ontology does not allow: everywhere that a fact is named, as far as its arguments are constants. The rest is
-//! checked when it is bound.
+//! Facts that violate the task's ontology: checked wherever a fact is named, as far as its arguments are constants. The rest is
+//! checked when the fact is bound.
 
 use super::{Subject, expressions};
 use crate::diagnostic::Findings;
@@ -47,7 +47,7 @@ fn of_state(subject: &Subject<'_>, ontology: &Ontology, state: &State, findings:
     }
 }
 
-/// The constant facts that effects leave behind together.
+/// The constant facts that hold together after a list of effects.
 struct Together<'a> {
     ontology: &'a Ontology,
     facts: Vec<FactKey>,
@@ -57,7 +57,7 @@ impl Together<'_> {
     fn takes(&mut self, effect: &EffectExpr) -> Result<(), Violation> {
         match effect {
             EffectExpr::Delete(fact) => {
-                // What is not known yet may be any of them.
+                // An argument that is not known yet may match any of them.
                 let gone = fact.pattern(&NothingKnown);
                 self.facts.retain(|fact| !gone.matches(fact));
             }
@@ -83,7 +83,7 @@ fn key(pattern: FactPattern) -> Option<FactKey> {
     Some(FactKey { predicate: pattern.predicate, arguments: pattern.arguments.into_iter().collect::<Option<_>>()? })
 }
 
-/// What is said at one place.
+/// The context of one checked place.
 struct Said<'a> {
     ontology: &'a Ontology,
     at: Location,

@@ -1,6 +1,6 @@
-//! Preconditions that nothing establishes: no older state's effects and not the initial world.
+//! Preconditions that nothing establishes: neither an older state's effects nor the initial world.
 //!
-//! Without a declared `world` the facts at the start are whatever the system holds, so this is a warning then.
+//! Without a declared `world` the initial facts are unknown, so it is only a warning then.
 
 use super::{Subject, branches, functions, named};
 use crate::diagnostic::Findings;
@@ -18,7 +18,7 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     walk(subject, Program::ROOT, &mut established, findings);
 }
 
-/// The facts that may hold by now.
+/// The facts that may hold so far.
 #[derive(Default)]
 struct Established {
     everything: bool,
@@ -41,13 +41,13 @@ impl Established {
     }
 }
 
-/// In program order; what any branch or visit may have written counts.
+/// Walks in program order; everything counts that any branch or visit may have written.
 fn walk(subject: &Subject<'_>, id: StateId, established: &mut Established, findings: &mut Findings) {
     let state = subject.program.state(id);
     let repeats = matches!(state.kind, StateKind::ForEach { .. } | StateKind::While { .. });
     for list in state.lists() {
         if repeats || leads_back(subject.program, list) {
-            // A later visit sees what was written before.
+            // A later visit of the list sees what an earlier one has written.
             list.iter().for_each(|child| establish_all(subject, *child, established));
         }
     }
@@ -75,7 +75,7 @@ fn walk(subject: &Subject<'_>, id: StateId, established: &mut Established, findi
     establish(state, established);
 }
 
-/// Whether a transition leads from a state of a list to itself or to one before it.
+/// Whether a transition leads from a state of a list to itself or to an earlier one.
 fn leads_back(program: &Program, list: &[StateId]) -> bool {
     let position = |id: &StateId| list.iter().position(|other| other == id);
     list.iter().any(|from| {
@@ -97,7 +97,7 @@ fn establish(state: &State, established: &mut Established) {
     }
 }
 
-/// What effects may make true; deletions establish nothing.
+/// The facts that effects may make true; deletions establish nothing.
 fn writes(effects: &[EffectExpr]) -> Vec<FactPattern> {
     let mut patterns = Vec::new();
     for effect in effects {
@@ -121,16 +121,16 @@ fn finds(required: &Expr) -> bool {
     found
 }
 
-/// A fact without which the expression cannot be true, and which nothing establishes.
+/// A fact that must hold for the expression to be true, and that nothing establishes.
 fn missing<'e>(required: &'e Expr, established: &Established) -> Option<&'e FactExpr> {
     match required {
         Expr::Unary(UnaryOperator::Not, _) => None,
         Expr::Query(conditions) => conditions.iter().find_map(|condition| missing(condition, established)),
         Expr::Binary(BinaryOperator::And, a, b) => missing(a, established).or_else(|| missing(b, established)),
         Expr::Binary(BinaryOperator::Or, a, b) => missing(a, established).and_then(|_| missing(b, established)),
-        // There may be none of what is looked for.
+        // The query may be meant to find nothing.
         other if finds(other) => None,
-        // Absence can be what is asked for.
+        // The expression may be true because a fact is absent.
         Expr::Binary(BinaryOperator::NotEqual, ..) => None,
         Expr::Binary(_, a, b) if [a, b].into_iter().any(|e| **e == Expr::Literal(Value::Null)) => None,
         other => other.fact_expressions().into_iter().find(|fact| !established.may_hold(fact)),

@@ -1,5 +1,4 @@
-//! What the control flow never comes to, what it never gets out of, loops that do not fit into the window, and regions that get in
-//! each other's way.
+//! Unreachable states, states without a way out, loops that do not fit into the window, and conflicts between regions.
 
 use super::graph::Point;
 use super::{Subject, expressions};
@@ -27,15 +26,15 @@ fn unreachable(subject: &Subject<'_>, findings: &mut Findings) {
     if subject.begins_elsewhere {
         return;
     }
-    // What is done on the way out was written once, for every outcome; and a state that is cut short is left by the one for `preempted`, also where
-    // nothing of it ends so.
+    // A `finally` is written once and copied for every outcome. The copy for `preempted` is used when the state is cut short, even if nothing inside
+    // ends so.
     let finally = |state: &State| {
         let around = state.parent.and_then(|id| subject.program.state(id).annotations.finally.as_ref());
         around.is_some_and(|finally| finally.lastly.values().any(|lastly| *lastly == state.id))
     };
     for state in &subject.program.states {
         let reached = |id| subject.control.is_reached(Point::Begin(id));
-        // Of what is inside of an unreachable state nothing more is said.
+        // States inside of an unreachable state are not reported again.
         if !reached(state.id) && state.parent.is_none_or(reached) && !finally(state) {
             let help = "let a transition lead here, or remove it";
             findings.error("unreachable-state", state.location, &state.path, "nothing leads to this state", help);
@@ -55,7 +54,7 @@ fn dead_ends(subject: &Subject<'_>, findings: &mut Findings) {
     }
 }
 
-/// How many states one iteration visits at least is what the window must hold to look beyond it.
+/// The window must be able to hold the states that one iteration visits, so that it can look beyond the iteration.
 fn horizons(subject: &Subject<'_>, findings: &mut Findings) {
     for state in &subject.program.states {
         let (StateKind::ForEach { body, .. } | StateKind::While { body, .. }) = &state.kind else { continue };
@@ -75,7 +74,7 @@ fn nodes(program: &Program, state: &State) -> usize {
     if state.is_routine() || matches!(state.kind, StateKind::Action { .. }) {
         return 1;
     }
-    // Of a condition the longer branch.
+    // For a condition the longer branch.
     let list =
         |list: &[crate::id::StateId]| -> usize { list.iter().map(|id| nodes(program, program.state(*id))).sum() };
     match &state.kind {
@@ -84,10 +83,10 @@ fn nodes(program: &Program, state: &State) -> usize {
     }
 }
 
-/// What the states of a region touch.
+/// What the states of a region use.
 struct Touched<'a> {
     reads: Footprint,
-    /// The first state that computes without saying what it reads.
+    /// The path of the first computing state without `reads`.
     reads_everything: Option<String>,
     writes: Footprint,
     shared: Vec<FactExpr>,
@@ -125,7 +124,7 @@ fn touched<'a>(program: &'a Program, region: &'a State) -> Touched<'a> {
         let facts: Vec<FactExpr> = named.chain(looked_up).cloned().collect();
         let says_no_reads = is_action && annotations.reads.is_none();
         let open_reads = says_no_reads && annotations.nature != Nature::Computes;
-        // Who moves without a word of what it reads is warned of below, and is in nobody's way here.
+        // A motion without `reads` gets a warning below, and no conflict here.
         if says_no_reads && annotations.nature == Nature::Computes {
             touched.reads = Footprint::Everything;
             touched.reads_everything.get_or_insert_with(|| state.path.clone());
@@ -138,7 +137,7 @@ fn touched<'a>(program: &'a Program, region: &'a State) -> Touched<'a> {
         }
         let all = |f: Footprint, more: Footprint| f.union(more);
         touched.reads = all(touched.reads, FactExpr::footprint(&facts, &NothingKnown));
-        // What a wait foresees somebody else does.
+        // The effects that a wait foresees are made by somebody else.
         for effects in annotations.effects.values().filter(|_| !state.is_pause()) {
             touched.writes = all(touched.writes, EffectExpr::footprint(effects, &NothingKnown));
         }
@@ -147,7 +146,7 @@ fn touched<'a>(program: &'a Program, region: &'a State) -> Touched<'a> {
     touched
 }
 
-/// A kind of resource that one makes, removes or uses up, and of which the other one sees a difference. Who wants to hold what is made waits for it.
+/// The kind of a resource that one region creates, deletes or consumes while the other is affected. Blocking a created resource only waits.
 fn clash<'a>(one: &Touched<'a>, other: &Touched<'_>) -> Option<&'a str> {
     use ResourceOperation::{Block, Consume, Create, Delete, Exists};
     let sees = |changed: &ResourceExpr, seen: &ResourceExpr| match changed.operation {
@@ -160,7 +159,7 @@ fn clash<'a>(one: &Touched<'a>, other: &Touched<'_>) -> Option<&'a str> {
     one.resources.iter().find(|changed| meets(changed)).map(|changed| changed.kind.as_str())
 }
 
-/// Whether some resource may be meant by both: they are of one kind, and of no attribute do they say two values.
+/// Whether both lines may mean the same resource: they have the same kind and no attribute with different values.
 fn may_be_one(a: &ResourceExpr, b: &ResourceExpr) -> bool {
     let differ = |(name, value): &(String, Expr)| {
         let other = b.attributes.iter().find(|(other, _)| other == name).map(|(_, other)| other);
@@ -171,7 +170,7 @@ fn may_be_one(a: &ResourceExpr, b: &ResourceExpr) -> bool {
 
 fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings) {
     let all: Vec<Touched<'_>> = regions.iter().map(|region| touched(subject.program, region)).collect();
-    // Who watches a region changes nothing.
+    // A watch changes nothing.
     let is_watched = regions.iter().any(|region| region.is_watch());
     for (region, touched) in regions.iter().zip(&all) {
         if let Some(path) = &touched.unannotated.as_ref().filter(|_| !is_watched) {
@@ -211,7 +210,7 @@ fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings)
             let variable = variable.map(|name| format!("the variable `${name}`"));
             let resource = clash(first, second).or_else(|| clash(second, first));
             let resource = resource.map(|kind| format!("the task resource {kind}"));
-            // Who watches a region ends it in the moment in which a fact is written.
+            // A watch reacts to a fact as soon as it is written, so it is no conflict.
             let is_watched = regions[i].is_watch() || other.is_watch();
             let fact = fact.filter(|_| !is_watched);
             let together = "put them into one region";

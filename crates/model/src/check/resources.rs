@@ -1,5 +1,5 @@
-//! Resources: that the system can have them, that an action's provider is blocked, and that what claims to compute or to
-//! look cannot act.
+//! Resources: the system must be able to have them, an action must block its provider, and states that compute or sense
+//! must not block anything that actuates.
 
 use super::Subject;
 use super::graph::Point;
@@ -30,7 +30,7 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     }
 }
 
-/// The kinds that the task creates, and whether any of them is divisible.
+/// The kinds that the task creates, and whether they are divisible.
 type Created<'a> = BTreeMap<&'a str, bool>;
 
 fn is_task_class(resource: &ResourceExpr) -> bool {
@@ -74,7 +74,7 @@ fn offered(
     }
 }
 
-/// What one node blocks at once: its own lines by kind and attributes, merged with those around it by maximum.
+/// Checks what one node acquires at once of each kind against the offer.
 fn too_many(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
     use ResourceOperation::{Block, Consume, Create, Delete, Exists};
     let mut own = BTreeMap::<&str, (Quantity, usize)>::new();
@@ -82,7 +82,7 @@ fn too_many(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
         let (count, _) = own.entry(&resource.kind).or_insert((Quantity::ZERO, i));
         match resource.operation {
             Block => *count += resource.count,
-            // What contains others consumes at its end, when it holds nothing.
+            // A composite state consumes at its end, when it holds nothing.
             Consume if matches!(state.kind, StateKind::Action { .. }) => *count += resource.count,
             Consume | Exists => *count = (*count).max(resource.count),
             Create | Delete => {}
@@ -104,7 +104,7 @@ fn too_many(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
     }
 }
 
-/// How much of a kind that only the task creates there ever is; `None` where it is created over and over, or never.
+/// The largest total of a kind that only the task creates; `None` if it is created repeatedly or never.
 fn created_at_most(subject: &Subject<'_>, kind: &str) -> Option<Quantity> {
     let mut most = Quantity::ZERO;
     for state in &subject.program.states {
@@ -123,7 +123,8 @@ fn created_at_most(subject: &Subject<'_>, kind: &str) -> Option<Quantity> {
     (!most.is_zero()).then_some(most)
 }
 
-/// A part of a unit is asked for only of what is divisible: says the catalogue, or the task that creates it.
+/// Fractions of a unit may be required only of divisible resources, as the catalogue or the creating line of the task
+/// says.
 fn parts_of_a_unit(subject: &Subject<'_>, state: &State, created: &Created<'_>, findings: &mut Findings) {
     for (i, resource) in state.annotations.resources.iter().enumerate().filter(|(_, r)| !r.count.is_whole()) {
         let kind = resource.kind.as_str();
@@ -146,7 +147,7 @@ fn blocked<'a>(subject: &Subject<'a>, state: &State) -> BTreeSet<&'a str> {
     lines.filter(|r| r.operation == ResourceOperation::Block).map(|r| r.kind.as_str()).collect()
 }
 
-/// What a state holds is deleted before it is given back: the pool would refuse.
+/// A state must not delete what it holds, because the resource manager would refuse.
 fn deletes_what_it_holds(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
     let held = blocked(subject, state);
     for (i, resource) in state.annotations.resources.iter().enumerate() {
@@ -159,7 +160,7 @@ fn deletes_what_it_holds(subject: &Subject<'_>, state: &State, findings: &mut Fi
     }
 }
 
-/// Only nodes ask the resource manager.
+/// `exists` is for nodes only; only they ask the resource manager.
 fn exists_of_a_composite(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
     if matches!(state.kind, StateKind::Action { .. }) || state.is_routine() {
         return;
@@ -199,7 +200,7 @@ fn only_looks(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
             let i = state.annotations.resources.iter().position(|r| r.kind == kind);
             let at = i.map_or(state.location, |i| at(&format!("resources.{i}")));
             let message = format!("a state that {claim} cannot block `{kind}`, which moves the robot");
-            // Where a state around it holds it all along.
+            // A state around it blocks the resource all the time.
             let around = "a state around it blocks that for all its states: do this before that one begins, and give what it makes in";
             let help = if i.is_none() { around } else { help };
             findings.error("computes-actuates", at, &state.path, message, help);

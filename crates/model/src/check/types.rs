@@ -1,4 +1,4 @@
-//! The types of expressions, as far as they are known before anything runs; `any` fits everywhere and is checked then.
+//! The types of expressions, as far as they are known before the run; `any` fits every type and is checked at run time.
 
 use super::{Subject, Variables, constants, expressions, functions, named};
 use crate::diagnostic::Findings;
@@ -8,7 +8,7 @@ use crate::slot::Slot;
 use crate::value::{Type, Value};
 use std::collections::BTreeMap;
 
-/// How deep outputs of hierarchies may be made of outputs of hierarchies.
+/// Limit of outputs of hierarchies that refer to outputs of hierarchies.
 const MAX_INDIRECTION: usize = 32;
 
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
@@ -18,7 +18,7 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
             Types { subject, state, variables: variables(subject, state), elements: Variables::new(), indirection: 0 };
         let quantified = quantified(state);
         for (slot, expr) in expressions(program, state) {
-            // Quantified effects bind variables of their own; their elements are checked at run time.
+            // Quantified effects bind their own variables; these are checked at run time.
             let bound = expr.variables().iter().any(|name| quantified.contains(name));
             if bound && matches!(slot, Slot::Effect(_)) {
                 continue;
@@ -43,7 +43,7 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     }
 }
 
-/// What is meant by a text where a boolean is wanted, if other languages have it for one.
+/// The boolean meant by a text that other languages use for one.
 pub(crate) fn truth(text: &str) -> Option<&'static str> {
     match text.to_ascii_lowercase().as_str() {
         "true" | "yes" | "on" => Some("write `true`"),
@@ -52,7 +52,7 @@ pub(crate) fn truth(text: &str) -> Option<&'static str> {
     }
 }
 
-/// How a list is written where joints or a pose is wanted.
+/// How to write a list as joints or as a pose, where one is expected.
 pub(crate) fn called(wanted: &Type, items: &[String]) -> Option<String> {
     let function = match wanted {
         Type::Joints if !items.is_empty() => "joints",
@@ -62,7 +62,7 @@ pub(crate) fn called(wanted: &Type, items: &[String]) -> Option<String> {
     Some(format!("write \"{function}({})\"", items.join(", ")))
 }
 
-/// How a value of another type is written as one of the wanted type; empty where nothing is known.
+/// How to write a value as one of the expected type; empty if unknown.
 fn written(wanted: &Type, program: &Program, expr: &Expr) -> String {
     if let Expr::List(items) = expr {
         let items: Vec<String> = items.iter().map(|item| named(program, item)).collect();
@@ -80,7 +80,6 @@ fn written(wanted: &Type, program: &Program, expr: &Expr) -> String {
     }
 }
 
-/// The type of a value.
 pub(crate) fn of_value(value: &Value) -> Type {
     match value {
         Value::Null => Type::Any,
@@ -97,7 +96,7 @@ pub(crate) fn of_value(value: &Value) -> Type {
     }
 }
 
-/// The type that all fit into: one of them, or `any`.
+/// The common type: that of all of them, or `any`.
 fn common(types: impl Iterator<Item = Type>) -> Type {
     types
         .reduce(|a, b| {
@@ -112,7 +111,7 @@ fn common(types: impl Iterator<Item = Type>) -> Type {
         .unwrap_or(Type::Any)
 }
 
-/// A literal null may stand for an input that is left out.
+/// A literal null is accepted: it stands for an omitted input.
 fn fits(wanted: &Type, found: &Type, expr: &Expr) -> bool {
     wanted.accepts_type(found) || *expr == Expr::Literal(Value::Null)
 }
@@ -162,15 +161,15 @@ fn quantified(state: &State) -> Vec<&str> {
     names
 }
 
-/// The variables that a state sees: parameters, and those of the loops and hierarchies around it.
+/// The types of the variables in scope in a state: parameters, and those of the loops and hierarchies around it.
 fn variables(subject: &Subject<'_>, state: &State) -> Variables {
     let program = subject.program;
     let mut variables: Variables = program.parameters.iter().map(|p| (p.name.clone(), p.ty.clone())).collect();
-    // What is evaluated at its end or between its iterations sees what it binds itself.
+    // Expressions at a state's end or between iterations also see the state's own variables.
     let mut around: Vec<&State> = subject.around(state.id).collect();
     around.reverse();
     for outer in around {
-        // A scoped variable may be assigned what is of another type than what it began with.
+        // An assignment may give a scoped variable a value of another type.
         variables.extend(outer.variables.iter().map(|(name, _)| (name.clone(), Type::Any)));
         if let StateKind::While { index: Some(index), .. } = &outer.kind {
             variables.insert(index.clone(), Type::Int);
@@ -198,14 +197,14 @@ struct Types<'a> {
     subject: &'a Subject<'a>,
     state: &'a State,
     variables: Variables,
-    /// The elements of the comprehensions around.
+    /// The elements of the surrounding comprehensions.
     elements: Variables,
     indirection: usize,
 }
 
 type Found = Result<Type, Wrong>;
 
-/// Why an expression has no type.
+/// Error: an expression has no type.
 pub(super) struct Wrong {
     pub(super) rule: &'static str,
     pub(super) message: String,
@@ -327,7 +326,7 @@ impl Types<'_> {
         })
     }
 
-    /// What to write where one of these is the name of a variable without its `$`, which makes it a text; empty where none is.
+    /// The correction if one of these expressions is a variable name without `$`, which makes it a text; else empty.
     fn without_sign(&self, exprs: &[&Expr]) -> String {
         let is_variable = |name: &str| self.variables.contains_key(name) || self.elements.contains_key(name);
         let name = exprs.iter().find_map(|expr| match expr {
@@ -337,7 +336,7 @@ impl Types<'_> {
         name.map_or_else(String::new, |name| format!("the variable `{name}` is written `${name}`"))
     }
 
-    /// The same, in the body of a comprehension with such an element.
+    /// The same scope inside of a comprehension with this element.
     fn within(&self, element: &str, of: Type) -> Self {
         let mut elements = self.elements.clone();
         elements.insert(element.to_owned(), of);
@@ -354,7 +353,7 @@ impl Types<'_> {
         }
     }
 
-    /// The type of the list that a loop collects, if that is what an expression of it is.
+    /// The type of the list that a loop collects, if the expression is this list.
     fn collected(&self, state: &State, value: &Expr) -> Option<Type> {
         let Expr::Variable(list) = value else { return None };
         let pass = state.children().find(|child| self.subject.program.is_pass(*child))?;
@@ -366,7 +365,7 @@ impl Types<'_> {
         Types { subject, state: pass, variables, elements: Variables::new(), indirection }.of(added).ok()
     }
 
-    /// The declared type of a hierarchy's output, else that of its expression.
+    /// The declared type of a hierarchy's output, else the type of its expression.
     fn output(&self, state: &State, output: &TaskOutput) -> Type {
         if output.ty != Type::Any || self.indirection >= MAX_INDIRECTION {
             return output.ty.clone();

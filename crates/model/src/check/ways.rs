@@ -1,21 +1,20 @@
-//! Which outputs of other states an expression needs, and of which it takes the first that is there.
+//! The outputs of other states that an expression needs, and those among which `either` chooses.
 
 use crate::expression::{Expr, Function};
 use crate::id::StateId;
 use std::collections::BTreeSet;
 
-/// An output of a state.
 pub(super) type Flow<'e> = (StateId, &'e str);
 
-/// The outputs that an expression cannot do without, and those of which it takes the first that is there.
+/// The outputs that an expression always needs, and its `either` choices.
 #[derive(Default)]
 pub(super) struct Ways<'e> {
     pub(super) needed: BTreeSet<Flow<'e>>,
-    /// Each `either`, way by way.
+    /// By `either`, the outputs that each argument needs.
     pub(super) either: Vec<Vec<BTreeSet<Flow<'e>>>>,
 }
 
-/// Those of an expression.
+/// The outputs that an expression needs.
 pub(super) fn ways(expr: &Expr) -> Ways<'_> {
     fn collect<'e>(expr: &'e Expr, ways: &mut Ways<'e>) {
         match expr {
@@ -33,10 +32,11 @@ pub(super) fn ways(expr: &Expr) -> Ways<'_> {
     ways
 }
 
-/// So many ways of one expression are looked at. What is sure only by further ones is refused.
+/// Limit of alternatives per expression; what only further ones would make certain is refused.
 const MOST_WAYS: usize = 64;
 
-/// The outputs with which an expression has a value, way by way: what contains several `either` has a way for each choice among them.
+/// The alternative sets of outputs with which an expression has a value: with several `either`, one for each combination of their
+/// arguments.
 fn alternatives(expr: &Expr) -> Vec<BTreeSet<Flow<'_>>> {
     match expr {
         Expr::Port { state, port } => vec![BTreeSet::from([(*state, port.as_str())])],

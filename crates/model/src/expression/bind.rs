@@ -1,4 +1,4 @@
-//! Facts, effects and resources with their arguments evaluated, and the facts that an effect may touch while some of its
+//! Evaluates the arguments of facts, effects and resources, and finds the facts that an effect may write while some
 //! arguments are not known yet.
 
 use super::evaluate::{EvaluateError, described};
@@ -21,13 +21,13 @@ impl FactExpr {
         Ok(FactPattern { predicate: self.predicate.clone(), arguments: arguments.collect::<Result<_, _>>()? })
     }
 
-    /// The pattern as far as it is known: an argument that cannot be evaluated counts as `?`.
+    /// The pattern as far as it is known: an argument that cannot be evaluated becomes `?`.
     pub fn pattern(&self, scope: &dyn Scope) -> FactPattern {
         let arguments = self.arguments.iter().map(|argument| argument.as_ref().and_then(|a| term(a, scope).ok()));
         FactPattern { predicate: self.predicate.clone(), arguments: arguments.collect() }
     }
 
-    /// The patterns of several facts as far as they are known.
+    /// The patterns of several facts, as far as they are known.
     pub fn footprint(facts: &[FactExpr], scope: &dyn Scope) -> Footprint {
         let mut patterns = Vec::new();
         facts.iter().for_each(|fact| add(&mut patterns, fact.pattern(scope)));
@@ -45,7 +45,7 @@ impl FactExpr {
 }
 
 impl EffectExpr {
-    /// The changes that the effects are, in order. All are evaluated in the same scope: none sees another's change.
+    /// The changes of the effects, in order. All effects are evaluated in the same scope: none sees another's change.
     ///
     /// # Errors
     /// As [`Expr::evaluate`].
@@ -55,8 +55,8 @@ impl EffectExpr {
         Ok(changes)
     }
 
-    /// The facts that the effects may write, as far as they are known: what cannot be evaluated counts as `?`, and so does
-    /// the variable of a list that is not known.
+    /// The facts that the effects may write, as far as they are known: what cannot be evaluated becomes `?`, and so does
+    /// the variable of an unknown list.
     pub fn footprint(effects: &[EffectExpr], scope: &dyn Scope) -> Footprint {
         let mut patterns = Vec::new();
         footprint_into(effects, scope, &mut patterns);
@@ -188,7 +188,7 @@ mod tests {
             changes.iter().map(ToString::to_string).collect::<Vec<_>>(),
             ["set at(a) = true", "set at(b) = true"]
         );
-        // The loop's variable hides one of the same name outside, known or not.
+        // The quantifier's variable hides an outer one, even if its value is unknown.
         let outside = BTreeMap::from([("b".to_owned(), Value::String("other".into()))]);
         assert_eq!(printed(EffectExpr::footprint(&at_each_box(), &outside)), ["at(?)"]);
     }

@@ -5,8 +5,8 @@
 //! min_by($box in boxes, distance($box.pose, pose(0, 0, 0)))
 //! ```
 //!
-//! The element has a name of its own, which hides nothing: the parser refuses a name that is visible already. An evaluation looks at
-//! a bounded number of elements, those of comprehensions within it counted.
+//! The element's name hides nothing, because the parser refuses a name that is already visible. The number of elements that one
+//! evaluation visits is bounded, including those of nested comprehensions.
 
 use super::evaluate::{EvaluateError, described, order};
 use super::query::MAX_STEPS;
@@ -16,31 +16,31 @@ use crate::value::Value;
 use serde::{Deserialize, Serialize};
 use std::cell::Cell;
 
-/// An element costs as much of the bound as this many facts that a query looks at.
+/// One element costs as much of the bound as this number of facts in a query.
 const STEPS_PER_ELEMENT: u64 = 10;
 
-/// What is made of the values that the elements have.
+/// The kinds of comprehensions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Comprehension {
-    /// The list of the values.
+    /// The list of the body's values.
     Map,
-    /// The elements of which the condition holds.
+    /// The elements for which the condition holds.
     Filter,
-    /// The elements, those with the least value first; elements of equal value stay in their order.
+    /// The elements in increasing order of their values; elements with equal values keep their order.
     SortBy,
-    /// The first element with the least value; null where the list is empty.
+    /// The first element with the smallest value; null for an empty list.
     MinBy,
-    /// The first element with the greatest value; null where the list is empty.
+    /// The first element with the greatest value; null for an empty list.
     MaxBy,
-    /// Whether the condition holds of an element.
+    /// Whether the condition holds for any element.
     Any,
-    /// Whether the condition holds of every element.
+    /// Whether the condition holds for every element.
     All,
 }
 
 impl Comprehension {
-    /// Every one.
+    /// All kinds.
     pub const ALL: [Comprehension; 7] = [
         Comprehension::Map,
         Comprehension::Filter,
@@ -64,7 +64,7 @@ impl Comprehension {
         }
     }
 
-    /// How it is written.
+    /// Its usage.
     pub fn usage(self) -> &'static str {
         match self {
             Comprehension::Map => "map($x in list, value)",
@@ -77,7 +77,7 @@ impl Comprehension {
         }
     }
 
-    /// The one of a name.
+    /// The comprehension with this name.
     pub fn named(name: &str) -> Option<Comprehension> {
         Comprehension::ALL.into_iter().find(|comprehension| comprehension.name() == name)
     }
@@ -88,10 +88,10 @@ impl Comprehension {
     }
 }
 
-/// The value of the comprehension `whole`, which has these parts.
+/// Evaluates the comprehension `whole`, which has these parts.
 ///
 /// # Errors
-/// As [`Expr::evaluate`]; also for what is no list, keys that have no order among them, and more elements than the bound.
+/// As [`Expr::evaluate`]; also if the list is no list, if keys cannot be ordered, and if there are more elements than the bound.
 pub(super) fn evaluate(
     whole: &Expr,
     (what, name): (Comprehension, &str),
@@ -154,7 +154,7 @@ mod tests {
     use crate::expression::scope::NothingKnown;
     use crate::id::StateId;
 
-    /// Knows `$box` and the state `see` with its port `boxes`.
+    /// A scope with `$box` and the state `see` with its port `boxes`.
     struct Known;
 
     impl Names for Known {

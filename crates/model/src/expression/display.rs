@@ -1,11 +1,11 @@
-//! Expressions back to text, for messages. A state stands by its id (`s3.end`) where its name is not at hand.
+//! Expressions to text, for messages. States are shown by their ids (`s3.end`) where their names are not available.
 
 use super::{BinaryOperator, EffectExpr, Expr, FactExpr, UnaryOperator};
 use crate::value::Value;
 use std::fmt::{self, Display, Formatter};
 
 impl BinaryOperator {
-    /// As written.
+    /// The operator as written.
     pub fn symbol(self) -> &'static str {
         match self {
             BinaryOperator::Or => "or",
@@ -24,7 +24,7 @@ impl BinaryOperator {
         }
     }
 
-    /// How tightly it binds; larger is tighter.
+    /// Its precedence; larger binds tighter.
     pub(crate) fn precedence(self) -> u8 {
         match self {
             BinaryOperator::Or => 1,
@@ -121,7 +121,7 @@ impl Display for Expr {
             }
             Expr::Binary(operator, a, b) => {
                 let own = operator.precedence();
-                // Comparisons do not chain; the rest is left-associative.
+                // Comparisons do not chain; the other operators are left-associative.
                 a.within(f, if own == 4 { 5 } else { own })?;
                 write!(f, " {} ", operator.symbol())?;
                 b.within(f, own + 1)
@@ -165,7 +165,7 @@ fn separated<T: Display>(f: &mut Formatter<'_>, items: &[T]) -> fmt::Result {
     Ok(())
 }
 
-/// Whether the text reads as a bare word, that is: as an individual.
+/// Whether the text would be parsed as a bare word, that is, as an individual.
 pub(crate) fn is_word(text: &str) -> bool {
     let mut characters = text.chars();
     characters.next().is_some_and(|c| c.is_ascii_alphabetic() || c == '_')
@@ -173,5 +173,5 @@ pub(crate) fn is_word(text: &str) -> bool {
         && !KEYWORDS.contains(&text)
 }
 
-/// Words that are no individuals.
+/// Words that are no names of individuals.
 pub(crate) const KEYWORDS: [&str; 8] = ["or", "and", "not", "in", "exists", "true", "false", "null"];

@@ -1,8 +1,8 @@
 //! Expression → value.
 //!
-//! An absent fact is null; null counts as false where a boolean is asked for (closed world). `=` is exact, ints and floats
-//! compare as numbers. `/` always gives a float. Nothing here panics: what cannot be computed is an error that says why.
-//! The depth of an expression is bounded where it is parsed.
+//! An absent fact is null; null counts as false where a boolean is expected (closed world). `=` is exact, ints and floats compare as
+//! numbers. `/` always gives a float. Nothing here panics: what cannot be computed is an error with a reason. The depth of an expression is
+//! bounded by the parser.
 
 use super::query::{self, Flow, RunError};
 use super::scope::{Given, Lookup, Scope};
@@ -14,16 +14,16 @@ use std::collections::BTreeMap;
 /// The longest list that an expression may build.
 pub const MAX_LIST: usize = 100_000;
 
-/// An expression without a value.
+/// Error: an expression has no value.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum EvaluateError {
-    /// It needs something that has not been written yet; later it may have a value.
+    /// It needs something that has not been written yet; it may have a value later.
     #[error("{what} is not known yet")]
     NotYetKnown {
         /// What it needs.
         what: String,
     },
-    /// It will never have a value here.
+    /// It can never have a value here.
     #[error("`{expression}`: {problem}")]
     Wrong {
         /// The part of the expression that is wrong.
@@ -34,7 +34,7 @@ pub enum EvaluateError {
 }
 
 impl EvaluateError {
-    /// Whether waiting may help.
+    /// Whether the expression may have a value later.
     pub fn is_not_yet_known(&self) -> bool {
         matches!(self, EvaluateError::NotYetKnown { .. })
     }
@@ -44,7 +44,7 @@ impl Expr {
     /// The value in a scope.
     ///
     /// # Errors
-    /// [`EvaluateError::NotYetKnown`] while the scope misses a name; [`EvaluateError::Wrong`] where the values do not fit.
+    /// [`EvaluateError::NotYetKnown`] if the scope does not know a name yet; [`EvaluateError::Wrong`] if values do not fit.
     pub fn evaluate(&self, scope: &dyn Scope) -> Result<Value, EvaluateError> {
         self.value(scope).map(Cow::into_owned)
     }
@@ -61,7 +61,6 @@ impl Expr {
         }
     }
 
-    /// The error that this expression is wrong.
     pub(crate) fn wrong(&self, problem: impl Into<String>) -> EvaluateError {
         EvaluateError::Wrong { expression: self.to_string(), problem: problem.into() }
     }
@@ -133,7 +132,7 @@ impl Expr {
         })
     }
 
-    /// Whether the outputs that it uses are there where it is evaluated.
+    /// Whether the outputs that it uses exist in this scope.
     fn given(&self, scope: &dyn Scope) -> Given {
         match self {
             Expr::Port { state, port } => scope.given(*state, port),
@@ -162,7 +161,7 @@ impl Expr {
         }
     }
 
-    /// The answers to the query of `self`, as values of the wanted variables.
+    /// The answers to the query `self`, as values of the wanted variables.
     fn answers(&self, wanted: &[String], conditions: &[Expr], scope: &dyn Scope) -> Result<Vec<Value>, EvaluateError> {
         let plan = query::plan(conditions, &|name| scope.unknown(name).is_some());
         let plan = plan.map_err(|error| self.wrong(error.to_string()))?;
@@ -176,7 +175,7 @@ impl Expr {
             let value = match places.as_slice() {
                 [one] => row[*one].clone(),
                 several => {
-                    // In the body of a function a variable has more to its name than was written.
+                    // In the body of a function variables were renamed to `name of …`.
                     let fields = wanted.iter().map(|name| name.split(' ').next().unwrap_or_default().to_owned());
                     Value::Map(fields.zip(several.iter().map(|place| row[*place].clone())).collect())
                 }
@@ -245,8 +244,8 @@ impl Expr {
     }
 }
 
-/// Which of several ways `either` takes: the first that was written. What needs no output is always there, so nothing behind it counts. Only
-/// where none was written is it the first that has a default.
+/// The argument that `either` takes: the first one that was written. An argument that needs no output always exists, so arguments behind it
+/// do not count. If none was written, the first with a default.
 fn first_given<'e>(ways: &'e [Expr], scope: &dyn Scope) -> (Given, Option<&'e Expr>) {
     let mut by_default = None;
     for way in ways {
@@ -262,7 +261,7 @@ fn first_given<'e>(ways: &'e [Expr], scope: &dyn Scope) -> (Given, Option<&'e Ex
     (if by_default.is_some() { Given::Default } else { Given::Missing }, by_default)
 }
 
-/// A value in a message: its type, and itself where it is short.
+/// A value for a message: its type, and its text if that is short.
 pub(crate) fn described(value: &Value) -> String {
     match value {
         Value::Null => "nothing (null)".to_owned(),
@@ -393,7 +392,7 @@ mod tests {
     fn what_is_not_written_yet_is_not_an_error_of_the_program() {
         let port = Expr::Port { state: crate::id::StateId(3), port: "end".into() };
         assert!(port.evaluate(&NothingKnown).unwrap_err().is_not_yet_known());
-        // `if` evaluates only what it chooses.
+        // `if` evaluates only the chosen branch.
         let choice =
             Expr::Call(Function::If, vec![Expr::Literal(Value::Bool(false)), port, Expr::Literal(Value::Int(1))]);
         assert_eq!(choice.evaluate(&NothingKnown), Ok(Value::Int(1)));

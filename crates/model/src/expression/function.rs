@@ -1,7 +1,7 @@
-//! The built-in functions, on values.
+//! The built-in functions.
 //!
-//! What the two geometric ones know about a gripper is in [`crate::grasp`]. `place_pose` gives two poses that differ by half a turn
-//! about the vertical, because a box looks the same from both, unless it is told how many turns look the same.
+//! The assumptions of the two geometric functions about a gripper are in [`crate::grasp`]. `place_pose` gives two poses that differ
+//! by half a turn about the vertical, because a box looks the same from both, unless the number of such turns is given.
 
 use super::evaluate::{MAX_LIST, binary, described, equal, number, order};
 use super::{BinaryOperator, Function};
@@ -12,20 +12,20 @@ use crate::value::Value;
 use std::cmp::Ordering;
 use std::f64::consts::TAU;
 
-/// Classes that are wider than the fingers open, and open at the top.
+/// Classes of objects that are wider than the opened fingers, and open at the top.
 const HELD_BY_THE_RIM: [&str; 2] = ["Bowl", "Plate"];
 
-/// Classes that are round, and narrower than the fingers open.
+/// Classes of round objects that are narrower than the opened fingers.
 const HELD_AROUND: [&str; 2] = ["Can", "Cup"];
 
-/// So many different elements `unique` finds: each is compared with all of them.
+/// Limit of different elements in `unique`, because each element is compared with all found ones.
 const MAX_UNIQUE: usize = 1_000;
 
-/// As many alternatives as a planner takes.
+/// Limit of turns; a planner takes no more alternatives.
 const MAX_TURNS: i64 = 64;
 
 impl Function {
-    /// Every function.
+    /// All functions.
     pub const ALL: [Function; 26] = [
         Function::Len,
         Function::Range,
@@ -87,12 +87,12 @@ impl Function {
         }
     }
 
-    /// The function of a name.
+    /// The function with this name.
     pub fn named(name: &str) -> Option<Function> {
         Function::ALL.into_iter().find(|f| f.name() == name)
     }
 
-    /// How it is called.
+    /// Its usage.
     pub fn usage(self) -> &'static str {
         match self {
             Function::Len => "len(list)",
@@ -126,7 +126,7 @@ impl Function {
         }
     }
 
-    /// Whether it can be called with so many arguments.
+    /// Whether it takes this number of arguments.
     pub fn takes(self, arguments: usize) -> bool {
         match self {
             Function::Len
@@ -156,8 +156,8 @@ impl Function {
     }
 }
 
-/// The value of a call; the error says what is wrong with the arguments. `if` and `either` are not here: they do not
-/// evaluate all.
+/// The value of a call, or what is wrong with the arguments. `if` and `either` are evaluated elsewhere, because they skip
+/// arguments.
 pub(crate) fn call(function: Function, arguments: &[Value]) -> Result<Value, String> {
     if !function.takes(arguments.len()) {
         return Err(format!("expected `{}`", function.usage()));
@@ -180,7 +180,7 @@ pub(crate) fn call(function: Function, arguments: &[Value]) -> Result<Value, Str
         },
         (Function::Floor, [Value::Int(i)]) => Ok(Value::Int(*i)),
         (Function::Floor, [x]) => match number(x)?.floor() {
-            // What lies between these is exactly an int.
+            // Floats in this range convert to int exactly.
             x if (-9.2e18..=9.2e18).contains(&x) => Ok(Value::Int(x as i64)),
             x => Err(format!("{x} is too large for an int")),
         },
@@ -235,15 +235,16 @@ pub(crate) fn call(function: Function, arguments: &[Value]) -> Result<Value, Str
     }
 }
 
-/// The second of each pair, in the order of the first: numbers or strings. What is equal stays in its order.
+/// Sorts pairs by their first values (numbers or strings) and returns the second ones; equal ones keep their order.
 pub(super) fn sorted(mut keyed: Vec<(Value, Value)>) -> Result<Vec<Value>, String> {
-    // Every key is looked at once before, so that the comparison of two cannot fail.
+    // All keys are checked first, so that no later comparison can fail.
     if let Some((first, _)) = keyed.first() {
         for (key, _) in &keyed {
             order(first, key)?;
         }
     }
-    // Two large ints differ that equal the same float, which is no order: beside a float, all are compared as floats.
+    // Two different large ints may equal the same float, which would be no order. With a float among them, all are compared as
+    // floats.
     if keyed.iter().any(|(key, _)| matches!(key, Value::Float(_))) {
         let real = |key: &Value| key.as_number().unwrap_or(0.0);
         keyed.sort_by(|(a, _), (b, _)| real(a).total_cmp(&real(b)));
@@ -262,7 +263,8 @@ fn sum(items: &List) -> Result<Value, String> {
     )
 }
 
-/// The elements that no element before is equal to. So many comparisons that a list that differs everywhere has a bound of its own.
+/// The elements without duplicates. The number of different elements is bounded, because it takes that many comparisons per
+/// element.
 fn unique(items: &List) -> Result<Value, String> {
     let mut found: Vec<Value> = Vec::new();
     for item in items {
@@ -301,7 +303,7 @@ fn range(from: i64, to: i64) -> Result<Value, String> {
     Ok(Value::List((from..to).map(Value::Int).collect()))
 }
 
-/// The least or greatest of the arguments, or of the elements of the only one.
+/// The smallest or greatest of the arguments, or of the elements of the only argument.
 fn extreme(arguments: &[Value], wanted: std::cmp::Ordering) -> Result<Value, String> {
     let candidates: Vec<&Value> = match arguments {
         [Value::List(items)] => items.iter().collect(),

@@ -1,4 +1,4 @@
-//! Text → expression, by recursive descent.
+//! Parser: text → expression, by recursive descent.
 //!
 //! ```text
 //! or         = and { "or" and }
@@ -17,8 +17,8 @@
 //! effect     = ["set"] fact ["=" or] | ("delete" | "not") fact | ("increase" | "decrease") fact "by" or
 //! ```
 //!
-//! `?name` stands only in queries. What a name stands for is asked of [`Names`]. Text, nesting and the height of the tree are bounded, so that neither
-//! parsing nor evaluating can exhaust the stack.
+//! `?name` is allowed only in queries. [`Names`] resolves names. The length of the text, its nesting and the height of the tree are bounded, so that
+//! neither parsing nor evaluating can exhaust the stack.
 
 use super::display::KEYWORDS;
 use super::query::{PlanError, plan};
@@ -26,34 +26,34 @@ use super::token::{Token, tokens};
 use super::{BinaryOperator, Comprehension, EffectExpr, Expr, FactExpr, Function, UnaryOperator};
 use crate::value::Value;
 
-/// The longest text of an expression, in characters.
+/// Limit of an expression's text, in characters.
 pub const MAX_TEXT: usize = 10_000;
-/// How deep brackets and prefixes may nest.
+/// Limit of nested brackets and prefixes.
 const MAX_NESTING: usize = 48;
-/// How high the tree may grow (a chain of n operators has height n).
+/// Limit of the tree's height (a chain of n operators has height n).
 const MAX_HEIGHT: usize = 128;
 
-/// The rule of an error of syntax; names that are not found have rules of their own.
+/// The rule for syntax errors; unknown names have their own rules.
 pub const INVALID_EXPRESSION: &str = "invalid-expression";
 
-/// Why a text is no expression.
+/// Error: a text is no expression.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{message}")]
 pub struct ParseError {
-    /// Where, in characters from the start of the text.
+    /// The place, in characters from the start of the text.
     pub offset: usize,
-    /// Which rule of `check` it breaks.
+    /// The violated rule of `check`.
     pub rule: &'static str,
     /// What is wrong.
     pub message: String,
-    /// What to do; empty where the message says it.
+    /// What to do; empty if the message already tells.
     pub help: String,
 }
 
-/// Why a name stands for nothing here.
+/// Error: a name has no meaning here.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NameError {
-    /// Which rule of `check` it breaks.
+    /// The violated rule of `check`.
     pub rule: &'static str,
     /// What is wrong.
     pub message: String,
@@ -61,14 +61,14 @@ pub struct NameError {
     pub help: String,
 }
 
-/// What the names in an expression stand for.
+/// Resolves the names in an expression.
 pub trait Names {
     /// `$name`
     ///
     /// # Errors
     /// No such variable is visible here.
     fn variable(&mut self, name: &str) -> Result<Expr, NameError>;
-    /// A bare word: an output of the state itself where that is allowed, else `None` for the individual of that name.
+    /// A bare word: an output of the state itself if that is allowed here, else `None`, and the word is an individual.
     fn word(&mut self, word: &str) -> Option<Expr>;
     /// `state.port`
     ///
@@ -76,16 +76,16 @@ pub trait Names {
     /// No such port can be used here.
     fn port(&mut self, state: &str, port: &str) -> Result<Expr, NameError>;
 
-    /// Whether `name(…)` is a function of the file.
+    /// Whether `name(…)` is a function defined in the file.
     fn has_function(&self, name: &str) -> bool {
         let _ = name;
         false
     }
 
-    /// What a call of a function of the file comes to.
+    /// Replaces a call of a function of the file.
     ///
     /// # Errors
-    /// It is called with another number of arguments, or comes to too much.
+    /// The number of arguments is wrong, or the result is too large.
     fn call(&mut self, name: &str, arguments: Vec<Expr>) -> Result<Expr, NameError> {
         let (message, _) = (format!("there is no function `{name}`"), arguments);
         Err(NameError { rule: "unknown-function", message, help: String::new() })
@@ -109,7 +109,7 @@ impl ParseError {
 /// Parses an expression.
 ///
 /// # Errors
-/// [`ParseError`] at the first place that does not fit.
+/// [`ParseError`] at the first error.
 pub fn parse_expression(text: &str, names: &mut dyn Names) -> Result<Expr, ParseError> {
     parse(text, names, |parser| Ok(parser.or()?.expr))
 }
@@ -125,7 +125,7 @@ pub fn parse_fact(text: &str, names: &mut dyn Names) -> Result<FactExpr, ParseEr
 /// Parses the conditions of a query, `at(?box) = ?pose, weight(?box) < 2`.
 ///
 /// # Errors
-/// As [`parse_expression`]; also for what cannot be planned ([`super::query`]).
+/// As [`parse_expression`]; also if the query cannot be planned ([`super::query`]).
 pub fn parse_query(text: &str, names: &mut dyn Names) -> Result<Vec<Expr>, ParseError> {
     parse(text, names, |parser| Ok(parser.query(None)?.0))
 }
@@ -164,7 +164,7 @@ fn parse<T>(
     }
 }
 
-/// What somebody means by a token where an expression could have ended or gone on; empty where nothing is known.
+/// Advice for an unexpected token; empty if there is none.
 fn meant(token: &Token) -> String {
     match token {
         Token::Symbol("?") => "write `if(condition, a, b)`".to_owned(),
@@ -180,7 +180,7 @@ fn meant(token: &Token) -> String {
     }
 }
 
-/// A tree and its height.
+/// An expression and its height.
 struct Tree {
     expr: Expr,
     height: usize,
@@ -190,9 +190,9 @@ struct Parser<'a> {
     tokens: Vec<(usize, Token)>,
     next: usize,
     nesting: usize,
-    /// How many queries are open.
+    /// Number of open queries.
     queries: usize,
-    /// The names of the elements of the comprehensions that are open.
+    /// The element names of the open comprehensions.
     elements: Vec<String>,
     names: &'a mut dyn Names,
 }
@@ -505,7 +505,7 @@ impl Parser<'_> {
         self.node(Expr::Each { what, element, list: Box::new(list.expr), body: Box::new(body.expr) }, below)
     }
 
-    /// Expressions up to a closing bracket; the opening one is behind.
+    /// Expressions up to a closing bracket; the opening one has been read.
     fn list(&mut self, close: &str) -> Result<(Vec<Expr>, usize), ParseError> {
         let (mut items, mut below) = (Vec::new(), 0);
         while !self.takes(close) {
@@ -519,7 +519,7 @@ impl Parser<'_> {
         Ok((items, below))
     }
 
-    /// Conditions up to a closing bracket, or to the end.
+    /// Conditions up to a closing bracket, or to the end of the text.
     fn query(&mut self, close: Option<&str>) -> Result<(Vec<Expr>, usize), ParseError> {
         let at = self.offset();
         self.queries += 1;
@@ -536,7 +536,7 @@ impl Parser<'_> {
             self.expects(close)?;
         }
         self.queries -= 1;
-        // What a query around binds is known to this one.
+        // Variables that the outer query binds are known in an inner one.
         let inner = self.queries > 0;
         match plan(&conditions, &|_| false) {
             Err(PlanError::Unbound { .. }) if inner => {}
@@ -546,7 +546,7 @@ impl Parser<'_> {
         Ok((conditions, below))
     }
 
-    /// Whether this is `find(?name …`: no fact is called so.
+    /// Whether `find(?name …` begins here; no fact can have this form.
     fn finds(&self) -> bool {
         let begins = [Some(&Token::Symbol("(")), Some(&Token::Symbol("?"))];
         let next = |ahead: usize| self.tokens.get(self.next + ahead).map(|(_, token)| token);
@@ -557,7 +557,7 @@ impl Parser<'_> {
     fn find(&mut self, at: usize) -> Parsed {
         self.next += 2;
         let mut wanted = Vec::new();
-        // A variable and a comma: one that is wanted. The conditions come behind.
+        // A variable followed by a comma is a wanted one. The conditions come after them.
         while let [Some(Token::Symbol("?")), Some(Token::Word(name)), Some(Token::Symbol(","))] =
             [0, 1, 2].map(|ahead| self.tokens.get(self.next + ahead).map(|(_, token)| token))
         {
@@ -694,7 +694,6 @@ impl Parser<'_> {
     }
 }
 
-/// How deep an expression is.
 fn height(expr: &Expr) -> usize {
     let mut below = 0;
     expr.parts(&mut |part| below = below.max(height(part)));
@@ -708,7 +707,7 @@ mod tests {
     use crate::id::StateId;
     use proptest::prelude::*;
 
-    /// Knows `$box`, the state `plan` with its port `end`, and the own output `width_m`.
+    /// Names for tests: `$box`, the state `plan` with its port `end`, and the own output `width_m`.
     struct OneState;
 
     impl Names for OneState {

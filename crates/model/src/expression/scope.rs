@@ -1,6 +1,6 @@
-//! Where the names of an expression get their values.
+//! Scopes: where the names of an expression get their values.
 //!
-//! Values are borrowed where the scope has them: a field of an element of a long list costs no copy of the list.
+//! Values are borrowed from the scope where possible: using a field of an element of a long list does not copy the list.
 
 use crate::fact::{FactKey, FactPattern};
 use crate::id::StateId;
@@ -9,8 +9,8 @@ use std::borrow::Cow;
 use std::cell::Cell;
 use std::collections::BTreeMap;
 
-/// Gives names their values. `None` and [`Lookup::Unknown`] mean not known *yet*: a scope never guesses. What a scope does not say
-/// itself is what the scope around it says.
+/// Gives names their values. `None` and [`Lookup::Unknown`] mean not known *yet*: a scope never guesses. By default it asks the
+/// scope around it.
 pub trait Scope {
     /// The scope around this one, if there is one.
     fn outer(&self) -> Option<&dyn Scope> {
@@ -28,7 +28,7 @@ pub trait Scope {
     fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
         self.outer()?.port(state, port)
     }
-    /// Whether an output of another state is there, and why.
+    /// Whether an output of another state exists, and why.
     fn given(&self, state: StateId, port: &str) -> Given {
         self.outer().map_or(Given::NotYetKnown, |outer| outer.given(state, port))
     }
@@ -36,47 +36,49 @@ pub trait Scope {
     fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
         self.outer().map_or(Lookup::Unknown, |outer| outer.fact(pattern))
     }
-    /// Visits the facts that match, in the order of keys, until told to stop; others may be among them. Whether they are known.
+    /// Visits the facts that match, in the order of keys, and possibly others, until `visit` returns false. Returns whether they
+    /// are known.
     fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
         self.outer().is_some_and(|outer| outer.each_fact(pattern, visit))
     }
-    /// `?name`: what a query around has bound.
+    /// `?name`: a variable bound by the query around it.
     fn unknown(&self, name: &str) -> Option<Cow<'_, Value>> {
         self.outer()?.unknown(name)
     }
-    /// `$name` in the body of a comprehension: the element that it is evaluated for.
+    /// `$name` in the body of a comprehension: the present element.
     fn element(&self, name: &str) -> Option<Cow<'_, Value>> {
         self.outer()?.element(name)
     }
-    /// How many facts the query around may still look at, with those within it. An element of a comprehension counts as several.
+    /// Number of facts that the query around it, with inner queries, may still visit. An element of a comprehension counts as
+    /// several.
     fn budget(&self) -> Option<&Cell<u64>> {
         self.outer()?.budget()
     }
 }
 
-/// Whether an output, or what is made of outputs, is there. What is made of several is as the greatest of them.
+/// Whether an output exists, or an expression of outputs. An expression has the greatest value among its parts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Given {
     /// It needs no output.
     Always,
-    /// A state on the way to here has written it.
+    /// A state on the path to this place has written it.
     Written,
-    /// No state has, and the port has a default.
+    /// No state has written it, and the port has a default.
     Default,
-    /// A state on the way to here may still write it.
+    /// A state on the path to this place may still write it.
     NotYetKnown,
-    /// It is not there, and never will be.
+    /// It does not exist and never will.
     Missing,
 }
 
-/// What a scope knows of a fact.
+/// The result of looking up a fact.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Lookup<'a> {
     /// The scope does not know (yet) which facts hold.
     Unknown,
     /// No fact matches.
     Absent,
-    /// The value of the first that matches.
+    /// The value of the first fact that matches.
     Holds(Cow<'a, Value>),
 }
 
@@ -93,7 +95,7 @@ impl Scope for BTreeMap<String, Value> {
     }
 }
 
-/// Another scope with one variable more, which hides one of the same name.
+/// Another scope with one more variable, which hides an outer one of the same name.
 pub struct WithVariable<'a> {
     /// The scope around it.
     pub outer: &'a dyn Scope,
@@ -121,7 +123,7 @@ pub struct WithElement<'a> {
     pub name: &'a str,
     /// Its value.
     pub value: &'a Value,
-    /// What the evaluation may still look at.
+    /// What remains of the evaluation's budget.
     pub left: &'a Cell<u64>,
 }
 

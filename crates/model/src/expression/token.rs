@@ -1,8 +1,7 @@
-//! Text → tokens, each with its place.
+//! Tokens: text → tokens, each with its place.
 
 use super::parse::ParseError;
 
-/// A token.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Token {
     /// A name or a keyword.
@@ -17,15 +16,15 @@ pub(crate) enum Token {
     Text(String),
     /// An operator or a bracket.
     Symbol(&'static str),
-    /// Behind the last one.
+    /// The end of the text.
     End,
 }
 
-/// Longer ones first.
+/// Symbols; longer ones first.
 const SYMBOLS: [&str; 22] =
     ["==", "!=", "<=", ">=", "=", "<", ">", "+", "-", "*", "/", "(", ")", "[", "]", "{", "}", ",", ".", ":", "?", "|"];
 
-/// What other languages write, and what stands for it in this one. Longer ones first.
+/// Operators of other languages and their replacements; longer ones first.
 const FOREIGN: [(&str, &str); 10] = [
     ("===", "="),
     ("!==", "!="),
@@ -38,11 +37,11 @@ const FOREIGN: [(&str, &str); 10] = [
     ("!", "not"),
     ("%", "n - m * floor(n / m)"),
 ];
-/// Units that people write behind a number.
+/// Units that people write after a number.
 const UNITS: [&str; 11] = ["s", "ms", "min", "h", "m", "cm", "mm", "rad", "deg", "kg", "g"];
 
 impl Token {
-    /// As it stands in a message.
+    /// The token for a message.
     pub(crate) fn described(&self) -> String {
         match self {
             Token::Word(word) => format!("`{word}`"),

@@ -11,7 +11,7 @@ impl Expr {
         self.parts(&mut |part| part.visit(visit));
     }
 
-    /// Calls `visit` for every expression that it is directly made of.
+    /// Calls `visit` for every direct part.
     pub(crate) fn parts<'a>(&'a self, visit: &mut dyn FnMut(&'a Expr)) {
         match self {
             Expr::Literal(_)

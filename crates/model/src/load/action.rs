@@ -1,11 +1,11 @@
-//! What a state's action says in the state's place: annotations of the catalogue, in terms of what the state gives the action's ports.
+//! Annotations that a state takes from its action in the catalogue, with the state's inputs in place of the action's ports.
 //!
-//! The rule: what a state says under a key stands in place of what its action says under it. `computes`, `senses` and `pia` count as one key. Only
-//! `effects` add up: a state's stand in place of the action's of the same predicate alone. (Else a state that names a fact of its own would
-//! silently promise that the arm did not move.)
+//! The rule: a state's own annotation replaces the action's annotation under the same key. `computes`, `senses` and `pia` count as one key. Only `effects` are
+//! combined: a state's effects replace only the action's effects on the same predicate. (Else a state that declares one fact of its own would silently declare
+//! that the arm did not move.)
 //!
-//! What the task's ontology has no predicate for is left out ([`super::allowed`]). An annotation that needs an input which the state does not give is not in force, and a warning says so: without it the state may read and
-//! change more, which is safe.
+//! Facts whose predicate the task's ontology does not have are left out ([`super::allowed`]). An annotation that needs an input which the state does not give
+//! is not in force, and a warning says so. That is safe, because without it the state may read and change more.
 
 use super::allowed::OfAction;
 use super::fields::Fields;
@@ -22,29 +22,29 @@ use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet};
 use std::rc::Rc;
 
-/// The ports of an action, as its annotations see them from one state.
+/// The ports of an action, as its annotations see them for one state.
 #[derive(Debug)]
 pub(crate) struct Ports {
     /// `provider/action`
     name: String,
     signature: ActionSignature,
-    /// What the state gives its inputs; what is `null` is not given.
+    /// The state's expressions for the inputs; inputs that are `null` are left out.
     inputs: BTreeMap<String, Expr>,
-    /// The outputs that it writes.
+    /// The outputs in the state's `out`.
     written: BTreeSet<String>,
-    /// What was asked for and is not there.
+    /// An input or output that was needed and is missing.
     missing: RefCell<Option<String>>,
-    /// How many parts the inputs have that the text being read has used.
+    /// Number of expression parts inserted into the present text by inputs.
     parts: Cell<usize>,
 }
 
 impl Ports {
-    /// Another of the action's texts is read.
+    /// Called before each of the action's texts is parsed.
     pub(crate) fn begins_text(&self) {
         self.parts.set(0);
     }
 
-    /// What `$name` stands for; anything where the state does not give it.
+    /// The expression for `$name`; a placeholder if the state does not give this input.
     pub(crate) fn input(&self, name: &str) -> Result<Expr, NameError> {
         if let Some(error) = unknown_input(&self.signature, name) {
             return Err(error);
@@ -66,7 +66,7 @@ impl Ports {
         Ok(given.clone())
     }
 
-    /// What a bare word in effects stands for, where it is an output.
+    /// The output for a bare word in effects, if the action has it.
     pub(crate) fn output(&self, word: &str) -> Option<Expr> {
         self.signature.outputs.contains_key(word).then(|| {
             if !self.written.contains(word) {
@@ -76,25 +76,25 @@ impl Ports {
         })
     }
 
-    /// An error in one of the action's texts, for the state that uses the action.
+    /// An error in one of the action's texts, reported for the state that uses the action.
     pub(crate) fn told(&self, text: &str, message: &str) -> String {
         format!("the catalogue says `{text}` of `{}`: {message}", self.name)
     }
 }
 
-/// The keys that say what a state is; one stands in the place of all.
+/// The keys for a state's nature; one replaces all.
 const NATURES: [&str; 3] = ["computes", "senses", "pia"];
 
-/// Where the annotations of one state come from: the state, then its action.
+/// The sources of one state's annotations: first the state, then its action.
 pub(crate) struct Sources<'b> {
     body: &'b Node,
     action: Option<(Annotations, Rc<Ports>, Location)>,
-    /// Who says what is in force, by key.
+    /// The origin of each annotation in force, by key.
     pub(crate) origin: BTreeMap<String, Origin>,
 }
 
 impl<'b> Sources<'b> {
-    /// Of a step whose inputs have been read.
+    /// The sources for a step whose inputs have been read.
     pub(crate) fn of(fields: &Fields<'_, '_>, step: &Step<'b>, kind: &StateKind) -> Sources<'b> {
         let says = || {
             let (Form::Action { action: node }, StateKind::Action { inputs, outputs, .. }) = (&step.form, kind) else {
@@ -119,7 +119,7 @@ impl<'b> Sources<'b> {
         Sources { body: step.body, action: says(), origin: BTreeMap::new() }
     }
 
-    /// What is said under a key, read.
+    /// The annotation under a key, parsed.
     pub(crate) fn read<T: OfAction>(
         &mut self,
         fields: &mut Fields<'_, '_>,
@@ -133,8 +133,8 @@ impl<'b> Sources<'b> {
         self.of_action(fields, key, read)
     }
 
-    /// What the state changes: what it says, and what its action changes beside that. What success would set of facts that the action leaves unknown
-    /// where it fails is deleted with every other outcome of which the state says nothing of that predicate.
+    /// The effects of a state: its own, and its action's on other predicates. For outcomes other than success, facts that success would set are deleted if the
+    /// action leaves them unknown after a failure and the state declares no effect on that predicate.
     pub(crate) fn effects(
         &mut self,
         fields: &mut Fields<'_, '_>,
@@ -185,7 +185,7 @@ impl<'b> Sources<'b> {
                 Some(_) => {}
             }
         }
-        // Nothing is something to say, too: what the action says of success holds also where the state speaks of other outcomes only.
+        // An empty list is an annotation, too: that success changes nothing stays true if the state mentions only other outcomes.
         if self.action.as_ref().is_some_and(|(said, ..)| said.effects.as_ref().is_some_and(Vec::is_empty)) {
             changed.entry(SUCCESS.to_owned()).or_default();
         }
@@ -215,7 +215,7 @@ impl<'b> Sources<'b> {
         Some(value)
     }
 
-    /// As [`Sources::read`] of a key of which each item stands for itself: one that is not in force takes no other with it.
+    /// As [`Sources::read`], for a key with independent items: an item that is not in force does not affect the others.
     pub(crate) fn read_each<T>(
         &mut self,
         fields: &mut Fields<'_, '_>,
@@ -241,7 +241,7 @@ impl<'b> Sources<'b> {
         all
     }
 
-    /// What the action says under a key, one item after the other, each with what it needs and the state does not have.
+    /// The items of the action's annotation under a key, each with the port that it needs and the state does not have, if any.
     fn each_of_action<T: OfAction>(
         &self,
         fields: &mut Fields<'_, '_>,
@@ -256,7 +256,7 @@ impl<'b> Sources<'b> {
 
     fn not_in_force(&self, fields: &mut Fields<'_, '_>, key: &str, missing: &str) {
         let Some((_, ports, at)) = &self.action else { return };
-        // A required input that is missing is an error of its own.
+        // A missing required input is reported as an error elsewhere.
         if ports.signature.inputs.keys().any(|input| !ports.inputs.contains_key(input)) {
             return;
         }
@@ -268,7 +268,7 @@ impl<'b> Sources<'b> {
         fields.out.findings.warning("annotation-not-in-force", *at, &path, message, format!("say `{key}` here"));
     }
 
-    /// Whether its action gives better results later: only where it counts as one that computes or senses.
+    /// Whether its action is anytime; only if the state computes or senses.
     pub(crate) fn is_anytime(&mut self, nature: &Nature) -> bool {
         let is = *nature != Nature::Irreversible && self.action.as_ref().is_some_and(|(said, ..)| said.anytime);
         if is {
@@ -277,7 +277,7 @@ impl<'b> Sources<'b> {
         is
     }
 
-    /// What the state is, where it does not say so itself.
+    /// The nature of the state: its own annotation, or else the action's.
     pub(crate) fn nature(
         &mut self,
         fields: &mut Fields<'_, '_>,
@@ -298,7 +298,7 @@ impl<'b> Sources<'b> {
         let said = self.action.as_ref().map_or(0, |(said, ..)| said.senses.len());
         match self.of_action(fields, "senses", senses) {
             Some(senses) if senses.len() == said => Nature::Senses(senses),
-            // What it looks at has no name in the task's world: then it waits for its place in the program.
+            // The ontology has no predicate for something that it senses: the state then waits for its place in the program.
             _ => {
                 self.origin.remove("senses");
                 Nature::default()
@@ -307,14 +307,14 @@ impl<'b> Sources<'b> {
     }
 }
 
-/// What a state gives an input, for expressions of the action.
+/// A state's expression for an input, for use in the action's expressions.
 fn as_input((name, given): &(String, Expr)) -> (String, Expr) {
     let mut given = given.clone();
     rename_inner(&mut given, name);
     (name.clone(), given)
 }
 
-/// A node of the action's, read in terms of its ports; what it needs and the state does not have.
+/// Reads a node of the action with its ports as names; also returns a port that it needs and the state does not have.
 fn in_its_terms<T: OfAction>(
     fields: &mut Fields<'_, '_>,
     ports: &Rc<Ports>,
@@ -330,7 +330,7 @@ fn in_its_terms<T: OfAction>(
     (value, ports.missing.take())
 }
 
-/// The fact that an effect sets, where it can be named without an output of the state's own: one that fails has none.
+/// The fact that an effect sets, if its key uses no output of the state itself: a state that fails has no outputs.
 fn named_before(effect: &EffectExpr) -> Option<&FactExpr> {
     let EffectExpr::Set(fact, _) = effect else { return None };
     let mut has_outputs = false;
@@ -339,7 +339,7 @@ fn named_before(effect: &EffectExpr) -> Option<&FactExpr> {
     (!has_outputs).then_some(fact)
 }
 
-/// The predicate that an effect on one fact changes.
+/// The predicate of an effect on a single fact.
 fn predicate(effect: &EffectExpr) -> Option<&str> {
     match effect {
         EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => Some(&fact.predicate),
@@ -347,7 +347,7 @@ fn predicate(effect: &EffectExpr) -> Option<&str> {
     }
 }
 
-/// What an action says under a key, as if it stood in the file where the state names the action.
+/// The action's annotation under a key, as a node at the place where the state names the action.
 fn node(said: &Annotations, key: &str, at: Location) -> Option<Node> {
     let place = |content| Node { at, offset: None, content };
     let list = |texts: &[String]| {

@@ -1,10 +1,9 @@
-//! What to do about a text that is no YAML. The reader of YAML says where it stopped and in its own words why; people make a few mistakes
-//! over and over, and the line where it stopped shows which.
+//! Advice for a text that is no YAML. The YAML parser reports a place and a technical reason; people make a few typical mistakes, and the
+//! line at that place shows which.
 
 use super::yaml::InvalidYaml;
 use crate::program::Location;
 
-/// What a person would say who looks at the line.
 pub(super) fn advice(source: &str, error: &InvalidYaml) -> String {
     let lines: Vec<&str> = source.lines().collect();
     let index = (error.at.line as usize).saturating_sub(1);
@@ -34,7 +33,7 @@ pub(super) fn advice(source: &str, error: &InvalidYaml) -> String {
     indentation(line, above, &lines[..index]).unwrap_or_default()
 }
 
-/// `action:arm/move_to`: the key and the value, which read as one text.
+/// `action:arm/move_to`: key and value without a space, which is parsed as one text.
 fn unspaced(line: &str) -> Option<(&str, &str)> {
     let text = item(line);
     let (key, value) = text.split_once(':')?;
@@ -42,7 +41,7 @@ fn unspaced(line: &str) -> Option<(&str, &str)> {
     (is_key && value.starts_with(|c: char| c.is_ascii_alphabetic())).then_some((key, value))
 }
 
-/// `description: first: look`: the key and its value, if the reader stopped at a colon behind the first.
+/// `description: first: look`: the key and its value, if the parser stopped at the second colon.
 fn second_colon(line: &str, at: Location) -> Option<(&str, &str)> {
     let upto: String = line.chars().take(at.column as usize).collect();
     let within_braces = upto.rfind(['{', ',']).map(|brace| &line[brace + 1..]);
@@ -54,7 +53,7 @@ fn second_colon(line: &str, at: Location) -> Option<(&str, &str)> {
     (is_plain && value.contains(": ") && !value.contains('"')).then_some((key.trim(), value))
 }
 
-/// A line that stands in a column of its own.
+/// A line with wrong indentation.
 fn indentation(line: &str, above: Option<&str>, before: &[&str]) -> Option<String> {
     let own = indent(line);
     let above = above?;
@@ -70,7 +69,7 @@ fn indentation(line: &str, above: Option<&str>, before: &[&str]) -> Option<Strin
             indent(list) + 1
         ));
     }
-    // The keys beside it begin where those of the line above do, behind a `-`, too.
+    // The column in which the keys of the line above begin, after a `-` if there is one.
     let beside = above.len() - item(above).len();
     if own > beside {
         return Some(format!(
@@ -90,7 +89,7 @@ fn indentation(line: &str, above: Option<&str>, before: &[&str]) -> Option<Strin
     })
 }
 
-/// The line without its indentation and the `-` of a list.
+/// The line without its indentation and list dash.
 fn item(line: &str) -> &str {
     let line = line.trim_start();
     line.strip_prefix("- ").map_or(line, str::trim_start)

@@ -1,14 +1,14 @@
-//! What a task's ontology has no predicate for, or one of fewer or more arguments, is left out of what an action says: a fact that cannot be named
-//! can neither be read nor change.
+//! Removes facts from an action's annotations whose predicate the task's ontology does not have, or has with another number of arguments: a fact
+//! that cannot exist can neither be read nor change.
 
 use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::ontology::Ontology;
 use crate::program::ResourceExpr;
 use std::collections::BTreeMap;
 
-/// What stands under a key of an action's annotations.
+/// The value of one of an action's annotations.
 pub(super) trait OfAction {
-    /// Leaves out what the ontology has no predicate for.
+    /// Removes facts that the ontology does not allow.
     fn leave_out(&mut self, _: &Ontology) {}
 }
 

@@ -1,6 +1,6 @@
 //! A run that begins at another state than the first (`ratn run --from`).
 //!
-//! In each list on the way to that state, one is put in front that leads to the next on the way:
+//! In each list on the path to that state, a state is inserted in front that leads to the next state on the path:
 //!
 //! ```text
 //!                                states:
@@ -20,8 +20,8 @@ use crate::diagnostic::Findings;
 use crate::program::SUCCESS;
 use std::collections::BTreeSet;
 
-/// Has the states of a list begin at `from`: the name of one of them, or its path where it stands in others, as `cups/pick`. Of what is around it, each is
-/// begun once and in one way, so that it is clear what begins there.
+/// Makes the states of a list begin at `from`: the name of one of them, or a path into them, as `cups/pick`. Every state on the path must be entered
+/// exactly once and in one way, so that it is clear what begins there.
 pub(super) fn begin_at(list: &mut Node, from: &str, findings: &mut Findings) {
     let mut names = BTreeSet::new();
     keys(list, &mut names);
@@ -30,7 +30,7 @@ pub(super) fn begin_at(list: &mut Node, from: &str, findings: &mut Findings) {
     step(list, "", from, &name, findings);
 }
 
-/// The same for a list within the state of the path `around`.
+/// The same for a list inside of the state with the path `around`.
 fn step(list: &mut Node, around: &str, from: &str, name: &str, findings: &mut Findings) {
     let at = list.at;
     let Content::List(states) = &mut list.content else { return };
@@ -64,7 +64,7 @@ fn step(list: &mut Node, around: &str, from: &str, name: &str, findings: &mut Fi
     states.insert(0, node(Content::Map(vec![entry(name, Content::Map(keys))])));
 }
 
-/// Why a run cannot begin within a state, if it cannot.
+/// The reason why a run cannot begin inside of a state, if there is one.
 fn why_not(state: &Node, comes_back: bool) -> Option<&'static str> {
     let has = |key: &str| state.get(key).is_some();
     if has("do") {
@@ -88,14 +88,13 @@ fn why_not(state: &Node, comes_back: bool) -> Option<&'static str> {
     comes_back.then_some("a transition leads back to it or before it, and it begins at its own beginning then")
 }
 
-/// Whether a transition of a state leads to one of these names.
 fn leads_to_one_of(state: &Node, names: &[&str]) -> bool {
     let [entry] = state.entries() else { return false };
     let transitions = entry.value.get("transitions").map(Node::entries).unwrap_or_default();
     transitions.iter().any(|lead| matches!(&lead.value.content, Content::Text(to) if names.contains(&to.as_str())))
 }
 
-/// All keys of mappings, among them the names of states.
+/// Collects all keys of mappings, which include the names of states.
 fn keys(node: &Node, names: &mut BTreeSet<String>) {
     for entry in node.entries() {
         names.insert(entry.key.clone());

@@ -1,6 +1,6 @@
-//! A task file as the plain tree that it is, without its places: what other languages read, change and write again.
+//! A task file as a plain tree without locations, for other languages that read, change and write it.
 //!
-//! Nothing of it is checked but that it is YAML as task files have it: booleans are `true` and `false`, no key stands twice.
+//! The only check is that it is YAML as in task files: booleans are `true` and `false`, and keys are unique.
 
 use super::advice;
 use super::yaml::{self, Content, Node};
@@ -26,10 +26,10 @@ pub enum Document {
 }
 
 impl Document {
-    /// Reads it; `file` is its name in messages.
+    /// Parses a file; `file` is its name in messages.
     ///
     /// # Errors
-    /// The text is no YAML: a finding of the rule `invalid-yaml`, as [`super::load`] has it.
+    /// The text is no YAML: a finding with the rule `invalid-yaml`, as in [`super::load`].
     pub fn read(source: &str, file: &str) -> Result<Document, Box<Diagnostic>> {
         yaml::read(source).map(Document::of).map_err(|error| {
             let mut findings = Findings::default();

@@ -1,10 +1,10 @@
-//! An annotation of a state changed in the text of a task file, and nothing else: comments and layout stay. Pure.
+//! Changes one annotation of a state in the text of a task file, and keeps comments and layout. Pure.
 //!
-//! YAML writers would write the whole file anew. Here the text is searched for the lines of one key of one state, at the places that the
-//! loader knows, and only these change. The result is read again: unless it is exactly the old tree with this change in it, and has all the
-//! comments that there were, the change is refused. So a way of writing that is not understood costs a refusal and never a file.
+//! A YAML writer would write the whole file anew. Instead, the lines of one key of one state are located at the places that the loader
+//! knows, and only these lines change. The result is parsed again. The change is refused unless the result is exactly the old tree with this
+//! change, with all its comments. So a YAML form that this code does not understand leads to a refusal, never to a damaged file.
 //!
-//! Not done: states that have no text of their own (made by `regions: {for: …}` or through an alias), and those of libraries.
+//! Not supported: states without their own text (made by `regions: {for: …}` or through an alias), and states of libraries.
 
 mod scan;
 
@@ -35,37 +35,37 @@ pub const KEYS: [&str; 14] = [
     "exceptions",
     "shared",
 ];
-/// Longer lines are written as several.
+/// Longer lines are split into several.
 const LINE_WIDTH: usize = 120;
-/// Below these stand other states: what is added stands before them.
+/// Keys with lists of states below; a new key is inserted before them.
 const LISTS: [&str; 8] = ["states", "do", "then", "else", "regions", "cases", "default", "fallback"];
 
-/// A state as it is written.
+/// A state as written in the file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Written {
     /// Its path.
     pub path: String,
-    /// How many states are around it.
+    /// Number of states around it.
     pub depth: usize,
-    /// What it is: `action: gripper/grasp`, `for: box in look.boxes`.
+    /// Its form: `action: gripper/grasp`, `for: box in look.boxes`.
     pub form: String,
-    /// Where it stands.
+    /// Its location.
     pub location: Location,
-    /// The annotations that it may have, with what it says itself.
+    /// The annotations that it may have, with its own values.
     pub keys: Vec<(&'static str, Option<Document>)>,
-    /// Where each of all its keys stands.
+    /// The locations of all its keys.
     pub places: Vec<(Location, String)>,
-    /// Why it cannot be changed here.
+    /// Why it cannot be changed here, if so.
     pub fixed: Option<EditError>,
 }
 
-/// Why a text is not changed.
+/// Error: a text was not changed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum EditError {
-    /// There are no states to be found in it.
+    /// The states of the text cannot be found.
     #[error("line {}: {message}: the file cannot be read as a task; correct it in an editor first", at.line)]
     Unreadable {
-        /// Where.
+        /// The location.
         at: Location,
         /// What is wrong.
         message: String,
@@ -75,17 +75,17 @@ pub enum EditError {
         "there is no state `{path}` in this file: read the file again; a state of a library is changed in the library's file"
     )]
     NoState {
-        /// Which.
+        /// The path.
         path: String,
     },
-    /// A state of this form does not have such a key.
+    /// The form of the state does not allow this key.
     #[error("`{path}` cannot have `{key}`: a state with `{form}` may say {may}")]
     NoKey {
-        /// Of which state.
+        /// The state.
         path: String,
-        /// Which.
+        /// The key.
         key: String,
-        /// What the state is.
+        /// The state's form.
         form: String,
         /// The keys that it may have.
         may: String,
@@ -93,29 +93,29 @@ pub enum EditError {
     /// The state has no text of its own.
     #[error("`{path}` (line {}) has no text of its own: {why}; change it in an editor", at.line)]
     Shared {
-        /// Which.
+        /// The state.
         path: String,
-        /// Where.
+        /// Its location.
         at: Location,
-        /// Whence it is.
+        /// Where its text comes from.
         why: &'static str,
     },
-    /// It would change more than it should.
+    /// The change would affect more than this key.
     #[error("`{key}` of `{path}` (line {}) is not changed: {why}; change it in an editor", at.line)]
     Unsafe {
-        /// Of which state.
+        /// The state.
         path: String,
-        /// Which.
+        /// The key.
         key: String,
-        /// Where.
+        /// The location.
         at: Location,
-        /// What is in the way.
+        /// The obstacle.
         why: &'static str,
     },
 }
 
 impl Written {
-    /// The key at, or below which a place is; of findings, to show them where they belong.
+    /// The key at a location, or above it, so that findings can be shown at their key.
     pub fn key_at(&self, at: Location) -> Option<&str> {
         let before = self.places.iter().filter(|(place, _)| *place <= at);
         before.max_by_key(|(place, _)| *place).map(|(_, key)| key.as_str())
@@ -125,11 +125,11 @@ impl Written {
 /// A state with its place in the tree.
 struct Found<'n> {
     written: Written,
-    /// Its mapping, where it has a text of its own.
+    /// Its mapping, if it has a text of its own.
     body: Option<&'n Node>,
 }
 
-/// The states of a task file, in its order and as they are written.
+/// The states of a task file as written, in file order.
 ///
 /// # Errors
 /// [`EditError::Unreadable`].
@@ -138,10 +138,10 @@ pub fn written(text: &str) -> Result<Vec<Written>, EditError> {
     Ok(states(&root).into_iter().map(|found| found.written).collect())
 }
 
-/// The text with another value of a key of a state; without a value the key is not there any more.
+/// The text with another value for a key of a state; `None` removes the key.
 ///
 /// # Errors
-/// [`EditError`]: there is no such state or key, or nothing but this cannot be changed.
+/// [`EditError`]: the state or key does not exist, or cannot be changed separately.
 pub fn edited(text: &str, path: &str, key: &str, value: Option<&Document>) -> Result<String, EditError> {
     let root = read(text)?;
     let found = states(&root).into_iter().find(|found| found.written.path == path);
@@ -173,7 +173,7 @@ pub fn edited(text: &str, path: &str, key: &str, value: Option<&Document>) -> Re
     Ok(new)
 }
 
-/// A value on one line, as YAML has it.
+/// A value on one line, in YAML flow style.
 pub fn flow(value: &Document) -> String {
     match value {
         Document::Null => "null".to_owned(),
@@ -194,7 +194,7 @@ fn read(text: &str) -> Result<Node, EditError> {
     yaml::read(text).map_err(|error| EditError::Unreadable { at: error.at, message: error.message })
 }
 
-/// All states with their places. The tree is written out as the loader does it, so that their paths are the loader's.
+/// All states with their places. The tree is expanded as in the loader, so that paths agree.
 fn states(root: &Node) -> Vec<Found<'_>> {
     let mut whole = root.clone();
     let mut findings = Findings::default();
@@ -253,7 +253,7 @@ fn form(form: &Form<'_>, body: &Node) -> String {
     }
 }
 
-/// All mappings by where they begin, each with whether regions are made of it.
+/// All mappings by their location, each with whether regions are made from it.
 fn mappings<'n>(node: &'n Node, is_made: bool, found: &mut BTreeMap<Location, Vec<(&'n Node, bool)>>) {
     match &node.content {
         Content::List(items) => items.iter().for_each(|item| mappings(item, is_made, found)),
@@ -268,7 +268,7 @@ fn mappings<'n>(node: &'n Node, is_made: bool, found: &mut BTreeMap<Location, Ve
     }
 }
 
-/// The tree with the change in it; what is new stands at the index.
+/// The tree with the change; a new key is inserted at `index`.
 fn changed(node: &Node, body: &Node, key: &str, value: Option<&Document>, index: usize) -> Document {
     match &node.content {
         Content::List(items) => {
@@ -292,7 +292,6 @@ fn changed(node: &Node, body: &Node, key: &str, value: Option<&Document>, index:
     }
 }
 
-/// What is to be done to a text.
 struct Change<'c> {
     lines: Lines<'c>,
     body: &'c Node,
@@ -306,11 +305,11 @@ const ODD: &str = "the way in which this state is written is not understood";
 const ANCHORED: &str = "an anchor or an alias (`&`, `*`) stands there";
 
 impl Change<'_> {
-    /// The new text, and where among its keys that of a new one stands.
+    /// The new text, and the index of a new key among the state's keys.
     fn made(&self) -> Made {
         let entries = self.body.entries();
         let begin = self.lines.offset(self.body.at).ok_or(ODD)?;
-        // Keys that were merged into it (`<<`) stand elsewhere.
+        // Keys merged into the mapping (`<<`) stand elsewhere.
         let keys: Vec<usize> =
             entries.iter().map(|entry| self.lines.offset(entry.at)).collect::<Option<_>>().ok_or(ODD)?;
         let is_own = |(entry, at): (&Entry, &usize)| {
@@ -337,7 +336,7 @@ impl Change<'_> {
 
     fn in_flow(&self, keys: &[usize], place: Option<usize>) -> Made {
         let text = self.lines.text;
-        // From a key to the last character of its value, and the comma or bracket behind.
+        // From a key to the last character of its value, and the comma or bracket behind it.
         let span = |key: usize| {
             let end = flow_end(text, key).ok_or(ODD)?;
             let last = key + text[key..end].trim_end().len();
@@ -351,7 +350,7 @@ impl Change<'_> {
             let Some(written) = written else { return Ok((text.to_owned(), 0)) };
             let last_key = *keys.last().ok_or(ODD)?;
             let end = flow_end(text, last_key).ok_or(ODD)?;
-            // A comment may stand behind the last value.
+            // A comment may follow the last value.
             let last = scan::without_comments_end(text, last_key, end);
             let line = self.lines.line_of(last);
             let width = self.lines.content(line).chars().count() + written.chars().count() + 2;
@@ -390,7 +389,7 @@ impl Change<'_> {
         if text[..before].ends_with(',') {
             return Ok((self.splice(before - 1, last, ""), place));
         }
-        // A comment stands before it: the comma stays, too.
+        // A comment precedes it, so the comma stays.
         Ok((self.splice(key, last, ""), place))
     }
 
@@ -430,7 +429,7 @@ impl Change<'_> {
         if has_hidden_comment(&text[key..end]) {
             return Err("what looks like a comment stands behind a text over several lines (`|`, `>`)");
         }
-        // What was said in it stays: behind the key what stands on its line, else in lines of their own.
+        // Comments in the old value are kept: a comment on the key's line stays behind the key, others get their own lines.
         let first_line_end = end.min(self.lines.end(self.lines.line_of(key)));
         let behind = comments(&text[key..first_line_end]).first().map(|comment| {
             let at = first_line_end - comment.len();
@@ -471,7 +470,7 @@ impl Change<'_> {
                 let mut new = kept.concat();
                 let mut start = start;
                 if next == end {
-                    // The last line has no end: neither has what is the last one now.
+                    // The file's last line has no line end, so the new last line gets none.
                     new = new.trim_end_matches(['\n', '\r']).to_owned();
                     if new.is_empty() {
                         start = text[..start].trim_end_matches(['\n', '\r']).len();
@@ -479,7 +478,7 @@ impl Change<'_> {
                 }
                 Ok((self.splice(start, next, &new), place))
             }
-            // The first key of a list item: the next one takes its place.
+            // The first key of a list item: the next key takes its place.
             None => match keys.get(place + 1) {
                 Some(next) if comments(&text[key..*next]).is_empty() => Ok((self.splice(key, *next, ""), place)),
                 _ => Err("it is the first key of its list item, and a comment stands behind it"),
@@ -487,7 +486,7 @@ impl Change<'_> {
         }
     }
 
-    /// A list with an item on a line of its own each: those that it has already stay as they are written. Nothing where it has none of them.
+    /// A list with one item per line: items that are kept keep their text. `None` if no item is kept.
     fn list_kept(&self, key: usize, end: usize, old: &[Node], new: &[Document]) -> Option<String> {
         let (text, lines, newline) = (self.lines.text, &self.lines, self.lines.newline());
         let (first, last) = (lines.line_of(key), lines.line_of(end));
@@ -496,7 +495,7 @@ impl Change<'_> {
         if !head[..value_begins].ends_with(':') {
             return None;
         }
-        // Of each item the line of its dash, and the first of the comments above.
+        // For each item: the line of its dash, and the first line of the comments above it.
         let mut items: Vec<(usize, usize)> = Vec::new();
         let (mut depth, mut above) = (None, first + 1);
         for line in first + 1..=last {
@@ -537,7 +536,7 @@ impl Change<'_> {
         (next > 0).then_some(made)
     }
 
-    /// `key: value`, with what stands behind the key; on one line where it has been, or is short.
+    /// `key: value`, followed by `behind`; on one line if it was so before or is short.
     fn block(&self, value: &Document, indent: usize, is_block: bool, behind: &str) -> String {
         let (key, newline) = (self.key, self.lines.newline());
         let line = format!("{key}: {}{behind}", flow(value));

@@ -1,7 +1,7 @@
-//! `effects` of a state and `world` of a task.
+//! Reads `effects` of a state and `world` of a task.
 //!
-//! A list (or one text) is what happens on success; a mapping gives a list per outcome. An item is an effect as text, or
-//! `{for: b in boxes, do: [...]}`, for which `set`, `delete`, `increase` or `decrease` with one text is short.
+//! A list (or one text) holds for success; a mapping has a list per outcome. An item is an effect as text, or `{for: b
+//! in boxes, do: [...]}`; instead of `do` one of `set`, `delete`, `increase` or `decrease` with one text is allowed.
 
 use super::fields::Fields;
 use super::outline::header;
@@ -11,10 +11,9 @@ use crate::expression::parse::{parse_effect, parse_expression};
 use crate::program::SUCCESS;
 use std::collections::BTreeMap;
 
-/// Short for `do` with one effect.
+/// Keys that replace `do` with one effect.
 const VERBS: [&str; 4] = ["set", "delete", "increase", "decrease"];
 
-/// Effects by outcome.
 pub(crate) fn by_outcome(fields: &mut Fields<'_, '_>, node: &Node) -> BTreeMap<String, Vec<EffectExpr>> {
     let mut effects = BTreeMap::new();
     match &node.content {
@@ -32,7 +31,7 @@ pub(crate) fn by_outcome(fields: &mut Fields<'_, '_>, node: &Node) -> BTreeMap<S
     effects
 }
 
-/// A list of effects; what does not read is left out (and was complained of).
+/// Reads a list of effects; an effect that cannot be parsed is reported and left out.
 pub(crate) fn list(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<EffectExpr> {
     node.items().into_iter().filter_map(|item| effect(fields, item)).collect()
 }

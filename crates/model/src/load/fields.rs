@@ -1,4 +1,4 @@
-//! Reading the fields of a mapping: expressions with their places, plain numbers and flags, unknown keys.
+//! Reads the fields of a mapping: expressions with their locations, plain numbers and flags; reports unknown keys.
 
 use super::names::{NamesFrom, Task, View, suggestion};
 use super::yaml::{Content, Entry, Node};
@@ -13,7 +13,7 @@ use crate::resource::Quantity;
 use crate::value::Value;
 use std::collections::BTreeMap;
 
-/// Where the parts of states stand in the file: `(state, "in.goal")`, `(state, "requires.0")`.
+/// Locations of the parts of states: `(state, "in.goal")`, `(state, "requires.0")`.
 #[derive(Debug, Default)]
 pub(crate) struct Places {
     places: BTreeMap<(StateId, String), Location>,
@@ -24,7 +24,7 @@ impl Places {
         self.places.insert((state, part.into()), at);
     }
 
-    /// The states have become others, some of them several: transitions belong to the outermost of those that one became, all else to the innermost.
+    /// States were replaced by new ones, some by several: locations of transitions move to the outermost new state, all others to the innermost.
     pub(crate) fn move_to(&mut self, copies: &[BTreeMap<StateId, Vec<StateId>>]) {
         for ((id, part), at) in std::mem::take(&mut self.places) {
             let is_outside = part.starts_with("transitions") || part == "exceptional" || part.starts_with("shared");
@@ -35,24 +35,23 @@ impl Places {
         }
     }
 
-    /// The place of a part; of the state where the part's is not known.
+    /// The location of a part; that of the state if the part's is unknown.
     pub(crate) fn of(&self, state: StateId, part: &str, fallback: Location) -> Location {
         self.places.get(&(state, part.to_owned())).copied().unwrap_or(fallback)
     }
 }
 
-/// What loading adds to as it goes.
+/// The results that loading collects.
 #[derive(Debug, Default)]
 pub(crate) struct Output {
     pub(crate) findings: Findings,
     pub(crate) places: Places,
-    /// The task says what holds at the start.
+    /// Whether the task declares its initial world.
     pub(crate) declares_world: bool,
     /// The paths of the states that use a library.
     pub(crate) libraries: Vec<String>,
-    /// The functions of the file: name, how it is called, with how many arguments.
+    /// The functions of the file: name, usage, number of arguments.
     pub(crate) functions: Vec<(String, String, usize)>,
-    /// What stands around states.
     pub(crate) guards: BTreeMap<StateId, Guard>,
 }
 
@@ -69,9 +68,9 @@ impl<'t, 'a> Fields<'t, 'a> {
         self.out.findings.error(rule, at, &self.path, message, help);
     }
 
-    /// Complains of keys that are not known.
+    /// Reports unknown keys.
     pub(crate) fn keys(&mut self, node: &Node, known: &[&str]) {
-        // A key of nothing that is followed by one that does not belong here: its value is not indented.
+        // A key without value, followed by an unknown key: probably its value is not indented.
         let mut empty: Option<&str> = None;
         for entry in node.entries() {
             let key = entry.key.as_str();
@@ -87,14 +86,14 @@ impl<'t, 'a> Fields<'t, 'a> {
         }
     }
 
-    /// Notes where a part of the state stands.
+    /// Stores the location of a part of the state.
     pub(crate) fn note(&mut self, part: impl Into<String>, at: Location) {
         if let Some(state) = self.view.state {
             self.out.places.note(state, part, at);
         }
     }
 
-    /// A YAML value as an expression: text is parsed, the rest is what it is.
+    /// A YAML value as an expression: a text is parsed, other values are constants.
     pub(crate) fn expression(&mut self, node: &Node) -> Option<Expr> {
         match &node.content {
             Content::Null => Some(Expr::Literal(Value::Null)),
@@ -114,7 +113,7 @@ impl<'t, 'a> Fields<'t, 'a> {
         }
     }
 
-    /// Parses `text`, which stands in `node` from character `offset` on.
+    /// Parses `text`, which begins in `node` at character `offset`.
     pub(crate) fn parsed<T>(
         &mut self,
         node: &Node,
@@ -159,7 +158,7 @@ impl<'t, 'a> Fields<'t, 'a> {
         self.parsed(node, text, 0, parse_effect)
     }
 
-    /// The entries of a key that holds a mapping; anything else but nothing is refused.
+    /// The entries of a key whose value must be a mapping or missing.
     pub(crate) fn mapping<'n>(&mut self, body: &'n Node, key: &str, example: &str) -> &'n [Entry] {
         let Some(node) = body.get(key) else { return &[] };
         if !matches!(node.content, Content::Map(_) | Content::Null) {
@@ -197,7 +196,7 @@ impl<'t, 'a> Fields<'t, 'a> {
         count
     }
 
-    /// An amount of a resource: more than nothing.
+    /// An amount of a resource, greater than 0.
     pub(crate) fn quantity(&mut self, node: &Node, what: &str) -> Option<Quantity> {
         let number = match node.content {
             Content::Int(i) => i as f64,
@@ -239,10 +238,10 @@ impl<'t, 'a> Fields<'t, 'a> {
     }
 }
 
-/// For what stands within `{ }` or `[ ]` without quotes.
+/// Advice for unquoted text within `{ }` or `[ ]`.
 const QUOTE: &str = "quote it: within { } and [ ] a comma ends a text, so write \"pose(1, 2, 3)\"";
 
-/// Whether a parenthesis is open at the end of a text.
+/// Whether a parenthesis is not closed at the end of a text.
 fn is_cut_off(text: &str) -> bool {
     text.matches('(').count() > text.matches(')').count()
 }

@@ -13,10 +13,10 @@ use crate::program::{
 };
 use std::collections::BTreeMap;
 
-/// More outcomes than this of one state are refused.
+/// Limit of the outcomes of one state.
 const MAX_OUTCOMES: usize = 60;
 
-/// The custom outcomes of a state.
+/// Reads the custom outcomes of a state.
 pub(crate) fn outcomes(fields: &mut Fields<'_, '_>, id: StateId) -> Vec<String> {
     let (task, step) = (fields.task, fields.task.outline.step(id));
     let mut own: Vec<String> = match &step.form {
@@ -56,7 +56,7 @@ fn is_common(outcome: &str) -> bool {
     matches!(outcome, SUCCESS | ABORTED | PREEMPTED)
 }
 
-/// `transitions: {aborted: give_up}`: to a sibling, else to an outcome of the state around.
+/// Reads `transitions: {aborted: give_up}`: to a sibling, else to an outcome of the state around it.
 pub(crate) fn transitions(fields: &mut Fields<'_, '_>, id: StateId) -> BTreeMap<String, Target> {
     let mut transitions = BTreeMap::new();
     let step = fields.task.outline.step(id);
@@ -93,11 +93,11 @@ pub(crate) fn transitions(fields: &mut Fields<'_, '_>, id: StateId) -> BTreeMap<
     transitions
 }
 
-/// Refuses what is said of an outcome that a state cannot have; those by which what it contains leaves it are its own, too.
+/// Refuses annotations for outcomes that a state cannot have. Outcomes by which inner states leave it are its own, too.
 pub(crate) fn outcomes_exist(task: &Task<'_>, program: &Program, out: &mut Output) {
     let all = program.all_outcomes();
     let mut open = vec![false; program.states.len()];
-    // What a state contains comes after it; an action that is not in the catalogue may have any outcome.
+    // Inner states have larger ids than the states around them; an action that is not in the catalogue may have any outcome.
     for state in program.states.iter().rev() {
         let unknown = match &state.kind {
             StateKind::Action { provider, action, .. } => {
@@ -129,9 +129,9 @@ pub(crate) fn outcomes_exist(task: &Task<'_>, program: &Program, out: &mut Outpu
     }
 }
 
-/// What a state says of exceptions holds for what it contains, where that says nothing itself.
+/// `exceptions` of a state hold for the states inside that do not say it themselves.
 pub(crate) fn inherit_exceptions(states: &mut [State]) {
-    // What a state contains comes after it.
+    // Inner states have larger ids than the states around them.
     for at in 1..states.len() {
         let around = states[at].parent.and_then(|parent| states[parent.0 as usize].annotations.exceptions);
         let own = &mut states[at].annotations.exceptions;
@@ -149,7 +149,7 @@ fn leaving(around: &Step<'_>) -> Vec<String> {
     [SUCCESS, ABORTED, PREEMPTED].map(str::to_owned).into_iter().chain(declared).collect()
 }
 
-/// Complains of a name that a variable around the state, or a parameter, has already.
+/// Reports a name that a variable around the state, or a parameter, already has.
 pub(crate) fn named_once(fields: &mut Fields<'_, '_>, name: &str, at: Location) {
     let Some(id) = fields.view.state else { return };
     if fields.task.in_sight(id).contains(name) {
@@ -175,13 +175,13 @@ pub(crate) fn variables(fields: &mut Fields<'_, '_>, body: &Node) -> Vec<(String
     variables
 }
 
-/// `assign: {n: $n + 1}`: variables of the states around.
+/// Reads `assign: {n: $n + 1}`: variables of outer states.
 pub(crate) fn assign(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) -> Vec<(String, Expr)> {
     let mut assign = Vec::new();
     let inside = fields.view.inside;
     fields.view.own_outputs = true;
     fields.view.inside = !matches!(fields.task.outline.step(id).form, Form::Action { .. } | Form::Wait { .. });
-    // The loop has ended, and what it binds with it.
+    // The loop has ended, so its variables are out of scope.
     fields.view.of_loop = OfLoop::Nothing;
     for entry in fields.mapping(body, "assign", "{ tries: $tries + 1 }") {
         fields.note(format!("assign.{}", entry.key), entry.at);
@@ -216,7 +216,7 @@ pub(crate) fn decide(fields: &mut Fields<'_, '_>, body: &Node) -> Vec<(String, E
     decide
 }
 
-/// Retry, timeout, exceptions, determinism, shared facts.
+/// Reads retry, timeout, exceptions, determinism and shared facts.
 pub(crate) fn annotate(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotations) {
     retry(fields, body, annotations);
     limits(fields, body, annotations);
@@ -237,8 +237,8 @@ pub(crate) fn annotate(fields: &mut Fields<'_, '_>, body: &Node, annotations: &m
     }
 }
 
-/// `retry: 2` or `retry: {times, backoff, on, before}`. What the executive does itself stays with the action; the rest stands around the
-/// state.
+/// Reads `retry: 2` or `retry: {times, backoff, on, before}`. What the executive supports itself is stored in the action, the rest in a
+/// guard around the state.
 fn retry(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotations) {
     let Some(id) = fields.view.state else { return };
     let step = fields.task.outline.step(id);
@@ -276,8 +276,8 @@ fn retry(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotations
     }
 }
 
-/// `while: [lit(lamp)]` and `timeout: 20`. An action's time is the executive's to watch, and so are the conditions of a PIA; the rest stands
-/// around the state.
+/// Reads `while: [lit(lamp)]` and `timeout: 20`. The executive itself supports the timeout of an action and the conditions of a PIA; the
+/// rest is stored in a guard around the state.
 fn limits(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotations) {
     let Some(id) = fields.view.state else { return };
     let step = fields.task.outline.step(id);
@@ -295,7 +295,7 @@ fn limits(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotation
     }
 }
 
-/// `finally: […]`
+/// Reads `finally: […]`.
 fn finally(fields: &mut Fields<'_, '_>, body: &Node) {
     let Some(id) = fields.view.state else { return };
     let states = fields.task.outline.step(id).finally.clone();
@@ -326,7 +326,7 @@ fn conditions(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<Expr> {
     all
 }
 
-/// A condition that did not hold leads where a failure leads, unless the task says otherwise.
+/// By default the outcome `violated` has the target of a failure.
 pub(crate) fn lead_violated(fields: &Fields<'_, '_>, id: StateId, state: &mut State) {
     let step = fields.task.outline.step(id);
     if step.holds().is_none() || fields.task.outline.is_region(id) || state.transitions.contains_key(VIOLATED) {
@@ -340,7 +340,7 @@ pub(crate) fn lead_violated(fields: &Fields<'_, '_>, id: StateId, state: &mut St
     state.transitions.insert(VIOLATED.to_owned(), failed);
 }
 
-/// A number of seconds above 0.
+/// Reads a number of seconds above 0.
 pub(crate) fn positive(fields: &mut Fields<'_, '_>, node: &Node, what: &str) -> Option<f64> {
     let seconds = seconds(fields, node, what)?;
     if seconds == 0.0 {
@@ -350,10 +350,10 @@ pub(crate) fn positive(fields: &mut Fields<'_, '_>, node: &Node, what: &str) -> 
     Some(seconds)
 }
 
-/// A span that a task file gives is at most as long, some thirty years: longer ones are slips, and cannot all be counted.
+/// Limit of a duration in a task file, some thirty years: longer ones are mistakes and could overflow.
 const LONGEST_S: f64 = 1e9;
 
-/// A number of seconds, not below 0.
+/// Reads a number of seconds, 0 or more.
 fn seconds(fields: &mut Fields<'_, '_>, node: &Node, what: &str) -> Option<f64> {
     let seconds = match node.content {
         Content::Int(seconds) => Some(seconds as f64),

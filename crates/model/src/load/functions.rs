@@ -1,9 +1,9 @@
-//! `functions: { near($a, $b): … }`: pure expressions with parameters, of one file.
+//! `functions: { near($a, $b): … }`: pure expressions with parameters, local to one file.
 //!
-//! A call is replaced by the function's expression when the file is read, with the arguments in the place of the parameters: a program
-//! knows no functions, and what a state reads by one is seen as if it were written out. So an argument that is not looked at is not
-//! evaluated, and no function can use itself. Variables of comprehensions and queries inside get names that cannot be written, so that
-//! they never mean those of an argument.
+//! When the file is read, a call is replaced by the function's expression, with the arguments in place of the parameters. So a program contains no
+//! functions, and the facts that a state reads through one are visible to all checks. An argument that is not used is not evaluated, and recursion
+//! is impossible. Variables of comprehensions and queries inside get names that cannot be written in a file, so that they never capture variables
+//! of an argument.
 
 use super::names::suggestion;
 use super::yaml::{Content, Entry, Node};
@@ -14,14 +14,14 @@ use crate::expression::{Comprehension, Expr, Function};
 use crate::value::Value;
 use std::collections::BTreeMap;
 
-/// More functions than this are no task.
+/// Limit of functions in a file.
 const MAX_FUNCTIONS: usize = 200;
-/// How one is written.
+/// How to write a function.
 const EXAMPLE: &str = "write `near($a, $b): distance($a, $b) < 0.1` below `functions`";
-/// A call may not become a larger expression, in parts.
+/// Limit of the parts of an expression after replacing a call.
 pub(super) const MAX_PARTS: usize = 2_000;
 
-/// The functions of a file, with what they call in its place.
+/// The functions of a file, with the calls in their bodies already replaced.
 #[derive(Debug, Default)]
 pub(crate) struct Functions {
     all: BTreeMap<String, Defined>,
@@ -30,24 +30,24 @@ pub(crate) struct Functions {
 #[derive(Debug, Clone)]
 struct Defined {
     parameters: Vec<String>,
-    /// Nothing where it was refused.
+    /// `None` if it was refused.
     body: Option<Expr>,
 }
 
 impl Functions {
-    /// Whether there is one of a name.
+    /// Whether a function of this name exists.
     pub(crate) fn has(&self, name: &str) -> bool {
         self.all.contains_key(name)
     }
 
-    /// Name, how it is called, and with how many arguments.
+    /// Name, usage and number of arguments of each function.
     pub(crate) fn usages(&self) -> Vec<(String, String, usize)> {
         let usage =
             |(name, defined): (&String, &Defined)| (name.clone(), defined.usage(name), defined.parameters.len());
         self.all.iter().map(usage).collect()
     }
 
-    /// What a call comes to.
+    /// The expression that replaces a call.
     pub(crate) fn call(&self, name: &str, arguments: &[Expr]) -> Result<Expr, NameError> {
         match self.all.get(name) {
             Some(defined) => defined.call(name, arguments),
@@ -69,7 +69,7 @@ impl Defined {
             let message = format!("`{name}` takes {wanted} argument{plural}, and is given {given}");
             return Err(wrong("invalid-expression", message, &format!("write `{}`", self.usage(name))));
         }
-        // It was complained of where it stands; anything will do in its place.
+        // Already reported at its definition; any expression will do.
         let Some(mut body) = self.body.clone() else { return Ok(Expr::Literal(Value::Null)) };
         body.rewrite(&mut |part| {
             if let Expr::Variable(parameter) = part
@@ -92,8 +92,8 @@ fn wrong(rule: &'static str, message: String, help: &str) -> NameError {
     NameError { rule, message, help: help.to_owned() }
 }
 
-/// Gives the variables of comprehensions and queries inside names that nobody can write, so that they are none of what is put into the expression,
-/// or of what it is put into.
+/// Renames the variables of comprehensions and queries inside to names that cannot be written in a file. So they differ from all variables in an
+/// inserted expression and around it.
 pub(super) fn rename_inner(expression: &mut Expr, of: &str) {
     let own = |inner: &mut String| *inner = format!("{inner} of {of}");
     expression.rewrite(&mut |part| match part {
@@ -160,13 +160,13 @@ struct Reading<'a, 'f> {
     source: &'a str,
     written: BTreeMap<String, Written<'a>>,
     done: BTreeMap<String, Defined>,
-    /// Those that are being read, each because the one before calls it.
+    /// The functions that are being read, each because the one before calls it.
     under_way: Vec<String>,
     findings: &'f mut Findings,
 }
 
 impl Reading<'_, '_> {
-    /// Reads a function and, before it, those that it calls.
+    /// Reads a function, and first the functions that it calls.
     fn read(&mut self, name: &str) {
         if self.done.contains_key(name) {
             return;
@@ -211,7 +211,7 @@ impl Reading<'_, '_> {
     }
 }
 
-/// What names stand for in a function: its parameters, facts, and other functions.
+/// The names in a function: its parameters, facts, and other functions.
 struct Body<'r, 'a, 'f> {
     reading: &'r mut Reading<'a, 'f>,
     parameters: &'r [String],

@@ -1,7 +1,7 @@
-//! Putting the states of a library below the state that uses it.
+//! Inserts the states of a library below the state that uses it.
 //!
-//! States get other ids and paths. A variable of the library that is called like one in sight where it is used gets the path of
-//! that state before its name: the two have nothing to do with each other. So does every variable that no file can name ([`crate::guard`]): the
+//! States get new ids and paths. If a variable of the library has the same name as one in scope at the state that uses it, the path of that
+//! state is put before its name, because the two are unrelated. Generated variables ([`crate::guard`]) are always renamed so, because the
 //! library may be used twice.
 
 use crate::expression::{EffectExpr, Expr};
@@ -10,12 +10,12 @@ use crate::id::StateId;
 use crate::program::{Exceptions, Program, State, StateKind, Target};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Puts the states of a library below the state at this place, which is its root from then on; `in_sight` are the variables there.
+/// Inserts a library's states below the state `at`, which becomes the library's root; `in_sight` are the variables in scope there.
 pub(crate) fn graft(states: &mut Vec<State>, at: StateId, library: &Program, in_sight: &BTreeSet<String>) {
     let (path, location) = (states[at.0 as usize].path.clone(), states[at.0 as usize].location);
     let taken = bound(library).into_iter().filter(|name| in_sight.contains(*name) || is_made(name));
     let renamed = taken.map(|name| (name.to_owned(), format!("{path}/{name}"))).collect();
-    // The root becomes the state itself; the others come behind all there are.
+    // The root becomes the state itself; the others are appended.
     let moving = Moving { at, offset: states.len() as u64, renamed };
     for state in library.states.iter().skip(1) {
         let mut state = state.clone();
@@ -38,7 +38,7 @@ pub(crate) fn graft(states: &mut Vec<State>, at: StateId, library: &Program, in_
     root.kind = StateKind::Sequence { children, outputs };
 }
 
-/// Every variable that something in the program binds, its parameters included.
+/// Every variable that the program binds, including its parameters.
 fn bound(program: &Program) -> BTreeSet<&str> {
     let mut names: BTreeSet<&str> = program.parameters.iter().map(|parameter| parameter.name.as_str()).collect();
     for state in &program.states {

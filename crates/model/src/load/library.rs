@@ -1,7 +1,7 @@
-//! Libraries: a task file used as a state of another.
+//! Libraries: a task file that is used as a state of another one.
 //!
-//! A library is loaded and checked by itself, with its own name in messages; then its states are put below the state that uses
-//! it. Its parameters become scoped variables, its outputs output ports, its outcomes outcomes.
+//! A library is loaded and checked separately, with its own name in messages. Then its states are inserted below the state
+//! that uses it. Its parameters become scoped variables, its outputs output ports, its outcomes outcomes.
 
 use super::fields::Fields;
 use super::outline::{Form, Outline};
@@ -15,19 +15,19 @@ use crate::program::Program;
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 
-/// Libraries may use libraries this deep.
+/// Limit of nested libraries.
 const MAX_DEPTH: usize = 8;
-/// A task has no more libraries.
+/// Limit of the libraries of a task.
 const MAX_LIBRARIES: usize = 64;
-/// A task may not have more states with those of its libraries.
+/// Limit of the states of a task, including those of its libraries.
 const MAX_STATES: usize = 20_000;
 
-/// Where the texts of libraries come from.
+/// Gives the texts of libraries.
 pub trait Files {
-    /// The name (for messages, and to know it again) and the text of the file that `using` calls `path`.
+    /// The name (for messages and to identify the file) and the text of the file that `using` refers to as `path`.
     ///
     /// # Errors
-    /// Why it cannot be read.
+    /// The reason why it cannot be read.
     fn read(&self, using: &str, path: &str) -> Result<(String, String), String>;
 }
 
@@ -40,10 +40,10 @@ impl Files for NoFiles {
     }
 }
 
-/// Libraries by name, each loaded once; nothing where it was refused.
+/// Libraries by name, each loaded once; `None` if it was refused.
 pub(crate) type Known = RefCell<BTreeMap<String, Option<Program>>>;
 
-/// Loads the libraries that the steps of an outline use. A library that is refused is refused with its own findings.
+/// Loads the libraries that the steps of an outline use. The findings of a refused library are reported, too.
 pub(crate) fn load_all(
     outline: &Outline<'_>,
     loading: &Loading<'_>,
@@ -81,7 +81,7 @@ pub(crate) fn load_all(
     libraries
 }
 
-/// A library, or why there is none and what to do.
+/// A library, or the reason why it cannot be used and what to do.
 fn library(path: &str, loading: &Loading<'_>, inner: &mut Vec<Diagnostic>) -> Result<Program, (String, &'static str)> {
     if loading.around.len() >= MAX_DEPTH {
         return Err((format!("libraries use libraries at most {MAX_DEPTH} deep"), ""));
@@ -105,7 +105,7 @@ fn library(path: &str, loading: &Loading<'_>, inner: &mut Vec<Diagnostic>) -> Re
     around.push(loading.file.to_owned());
     let loaded = match super::load_within(&text, &Loading { file: &name, around, from: None, ..*loading }) {
         Ok(loaded) => {
-            // What holds before it begins is said where it is used.
+            // What holds before the library begins depends on its use.
             inner.extend(loaded.warnings.into_iter().filter(|warning| !depends_on_use(&warning.rule)));
             Some(loaded.program)
         }
@@ -118,12 +118,12 @@ fn library(path: &str, loading: &Loading<'_>, inner: &mut Vec<Diagnostic>) -> Re
     loaded.ok_or_else(refused)
 }
 
-/// Whether a rule says of a library something else wherever it is used.
+/// Whether the result of a rule depends on where a library is used.
 pub(crate) fn depends_on_use(rule: &str) -> bool {
     rule == "unestablished-precondition"
 }
 
-/// The parameters of a library as scoped variables: what `with` says, else their defaults.
+/// The parameters of a library as scoped variables: the values in `with`, else their defaults.
 pub(crate) fn parameters(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) -> Vec<(String, Expr)> {
     let Some(library) = fields.task.libraries.get(&id) else { return Vec::new() };
     let given = fields.mapping(body, "with", "{ boxes: 2 }");
@@ -159,7 +159,7 @@ pub(crate) fn parameters(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) 
         };
         bound.extend(value.map(|value| (parameter.name.clone(), value)));
     }
-    // Its own variables begin with what its parameters give; all are evaluated outside of the state.
+    // The library's own variables may use its parameters; all are evaluated outside of the state.
     let own = library.states[0].variables.iter().map(|(name, value)| {
         let mut value = value.clone();
         value.rewrite(&mut |part| give(&bound, part));
@@ -170,7 +170,7 @@ pub(crate) fn parameters(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) 
     bound
 }
 
-/// Puts the expression of a variable in its place.
+/// Replaces a variable by its expression.
 fn give(bound: &[(String, Expr)], expr: &mut Expr) {
     if let Expr::Variable(name) = expr
         && let Some((_, value)) = bound.iter().find(|(given, _)| given == name)

@@ -1,7 +1,7 @@
-//! What names stand for, seen from one state: variables of the loops around it, parameters, outputs of other states.
+//! Resolves names from the point of view of one state: variables of the loops around it, parameters, outputs of other states.
 //!
-//! A state's name is looked for among the siblings of this state and of those around it, inside out; then anywhere. That
-//! the state found can really have written its port by then is a rule of `check`.
+//! A state's name is looked up among the siblings of this state and of those around it, from inside out; then anywhere. Whether the
+//! state found can have written its port by then is a rule of `check`.
 
 use super::functions::Functions;
 use super::outline::{Form, Outline};
@@ -15,18 +15,18 @@ use crate::value::Type;
 use std::collections::{BTreeMap, BTreeSet};
 use std::rc::Rc;
 
-/// The port of a region that says how it ended.
+/// The port of a region with its outcome.
 const OUTCOME: &str = "outcome";
 
 /// The output ports of a state.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Ports {
     pub(crate) types: BTreeMap<String, Type>,
-    /// The action is unknown, so any port may exist.
+    /// Whether the action is unknown, so that any port may exist.
     pub(crate) open: bool,
 }
 
-/// Everything that is known of a task before its expressions are read.
+/// Everything known of a task before its expressions are read.
 pub(crate) struct Task<'a> {
     pub(crate) source: &'a str,
     pub(crate) catalogue: &'a Catalogue,
@@ -34,44 +34,44 @@ pub(crate) struct Task<'a> {
     /// By [`StateId`].
     pub(crate) ports: Vec<Ports>,
     pub(crate) parameters: Vec<String>,
-    /// Libraries that states use, loaded, by state.
+    /// The loaded libraries, by the state that uses them.
     pub(crate) libraries: BTreeMap<StateId, Program>,
-    /// Its own functions.
+    /// The file's own functions.
     pub(crate) functions: Functions,
-    /// What its facts may say; `None`: anything.
+    /// The ontology of its facts; `None` allows all facts.
     pub(crate) ontology: Option<Ontology>,
 }
 
-/// From where an expression sees the task.
+/// Determines the names that an expression sees.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct View {
-    /// The state; `None` sees parameters only.
+    /// The state; with `None` only parameters are visible.
     pub(crate) state: Option<StateId>,
-    /// It sees the state's children and its scoped variables (outputs of a hierarchy).
+    /// Whether the state's children and its scoped variables are visible (outputs of a hierarchy).
     pub(crate) inside: bool,
-    /// What it sees of a loop's own variables, when it is inside of the loop.
+    /// Which of a loop's own variables are visible, inside of the loop.
     pub(crate) of_loop: OfLoop,
-    /// A bare word may be an output of the state itself (its effects).
+    /// Whether a bare word may be an output of the state itself (in its effects).
     pub(crate) own_outputs: bool,
-    /// Further variables (of quantified effects).
+    /// Further variables, of quantified effects.
     pub(crate) variables: Vec<String>,
-    /// An annotation of the state's action is read: it sees the action's ports alone.
+    /// Set while an annotation of the state's action is read: only the action's ports are visible.
     pub(crate) action: Option<Rc<super::action::Ports>>,
 }
 
-/// What an expression of a loop sees of the variables that the loop binds.
+/// Which variables of a loop an expression of the loop sees.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) enum OfLoop {
-    /// The number of the iteration, between two of them.
+    /// The iteration number, between two iterations.
     #[default]
     Number,
-    /// All, at the end of an iteration.
+    /// All of them, at the end of an iteration.
     All,
-    /// Nothing, at the end of the loop.
+    /// None, at the end of the loop.
     Nothing,
 }
 
-/// The names of a task as one expression sees them.
+/// The names that one expression of a task sees.
 pub(crate) struct NamesFrom<'t, 'a> {
     pub(crate) task: &'t Task<'a>,
     pub(crate) view: &'t View,
@@ -90,13 +90,13 @@ impl Task<'_> {
             .flatten()
     }
 
-    /// Every variable that is in sight where a state stands.
+    /// Every variable in scope at a state.
     pub(crate) fn in_sight(&self, state: StateId) -> BTreeSet<String> {
         let around = self.loop_variables(state).chain(self.scoped_variables(state, false));
         around.chain(self.parameters.iter().map(String::as_str)).map(str::to_owned).collect()
     }
 
-    /// The scoped variables of the states around one, innermost first.
+    /// The scoped variables of the states around a state, innermost first.
     pub(crate) fn scoped_variables(&self, state: StateId, inside: bool) -> impl Iterator<Item = &str> {
         let around = inside.then_some(state).into_iter().chain(self.outline.containers(state));
         around.flat_map(|id| {
@@ -107,7 +107,7 @@ impl Task<'_> {
 }
 
 impl NamesFrom<'_, '_> {
-    /// The state of a name inside of one; in a condition one of each branch, and of each case of a `switch`.
+    /// The states with a name inside of a state: in a condition one per branch, and per case of a `switch`.
     fn inside(&self, around: StateId, name: &str) -> Vec<StateId> {
         let outline = &self.task.outline;
         let named = |id: &&StateId| outline.step(**id).name == name;
@@ -212,7 +212,7 @@ impl Names for NamesFrom<'_, '_> {
 }
 
 impl NamesFrom<'_, '_> {
-    /// A port of a state that was found.
+    /// A port of the state that was found.
     fn port_of(&self, from: StateId, id: StateId, port: &str) -> Result<Expr, NameError> {
         let ports = &self.task.ports[id.0 as usize];
         let state = &self.task.outline.step(id).name;
@@ -239,10 +239,10 @@ impl NamesFrom<'_, '_> {
     }
 }
 
-/// For a name that is none of those that are known: "did you mean" the nearest, or what there is, or `otherwise`. `prefix` stands before
-/// each name.
+/// Advice for an unknown name: "did you mean" the nearest known name, or a list of the known ones, or `otherwise`. `prefix` is put
+/// before each name.
 pub fn suggestion<'n>(name: &str, known: impl Iterator<Item = &'n str>, prefix: &str, otherwise: &str) -> String {
-    /// More names than this are not listed.
+    /// Limit of listed names.
     const MAX_LISTED: usize = 15;
     let mut known: Vec<&str> = known.collect();
     known.sort_unstable();
@@ -260,7 +260,7 @@ pub fn suggestion<'n>(name: &str, known: impl Iterator<Item = &'n str>, prefix: 
     format!("there is {}", listed.join(", "))
 }
 
-/// Edits (insert, delete, replace) from one name to the other; names beyond a sane length count as far apart.
+/// Edit distance (insert, delete, replace) of two names; very long names count as far apart.
 pub(crate) fn distance(a: &str, b: &str) -> usize {
     const MAX_LENGTH: usize = 64;
     if a.len().max(b.len()) > MAX_LENGTH {

@@ -1,5 +1,5 @@
-//! The tree of steps of a task file: what kinds of states there are, their names and their order, before any expression is
-//! read. So an expression may name states that stand further down, and the rules can say that they do.
+//! The tree of steps of a task file: kinds, names and order of the states, before any expression is read. So an expression may refer to a
+//! state further down, and the rules can report that.
 
 use super::yaml::{Content, Entry, Node};
 use crate::diagnostic::Findings;
@@ -8,20 +8,20 @@ use crate::expression::display::is_word;
 use crate::id::StateId;
 use crate::program::Location;
 
-/// The most states of a task.
+/// Limit of the states of a task.
 const MAX_STATES: usize = 10_000;
-/// How deep states may nest.
+/// Limit of nested states.
 const MAX_DEPTH: usize = 32;
 
-/// Keys that say what a step is.
+/// Keys that give the form of a step.
 const FORMS: [&str; 11] =
     ["action", "for", "condition", "states", "while", "do_while", "until", "concurrency", "library", "wait", "ask"];
-/// Those that were written out as others before ([`super::written_out`]).
+/// Forms that have been expanded before ([`super::written_out`]).
 const SHORT_FORMS: [&str; 2] = ["switch", "fallback"];
-/// Those that are names that people give to states, too.
+/// Forms whose names people also use for states.
 const NAMES: [&str; 2] = ["wait", "ask"];
 
-/// Keys that say in other languages what a step is, and how it is written here.
+/// Keys of other languages for the form of a step, and how to write it here.
 const FOREIGN_FORMS: [(&str, &str); 10] = [
     ("selector", "write `- name:`, with `fallback: […]`"),
     ("if", CONDITION),
@@ -40,19 +40,19 @@ const FOREIGN_FORMS: [(&str, &str); 10] = [
 const CONDITION: &str = "write `- condition: …`, with `then: […]` and `else: […]`";
 const COUNTED: &str = "write `- for: i in range(n)`, with `do: […]`";
 
-/// Whether a key of a list item says what the state is. `wait: { action: … }` is a state that is called `wait`.
+/// Whether a key of a list item gives the form of the state. `wait: { action: … }` is a state named `wait`.
 fn is_form(entry: &Entry) -> bool {
     let is_state = |entry: &Entry| entry.value.entries().iter().any(|inner| FORMS.contains(&inner.key.as_str()));
     FORMS.contains(&entry.key.as_str()) && !(NAMES.contains(&entry.key.as_str()) && is_named(entry, is_state))
 }
 
-/// Whether what stands below `wait` or `ask` is a state. `for`, `until` and `signal` say what is waited for.
+/// Whether the value of `wait` or `ask` is a state. With `for`, `until` or `signal` it is a wait.
 fn is_named(entry: &Entry, is_state: impl Fn(&Entry) -> bool) -> bool {
     let has = |key: &str| entry.value.get(key).is_some();
     is_state(entry) && (entry.key == "ask" || !(has("for") || has("until")) || has("do"))
 }
 
-/// The key of a form that there is in other languages, and how it is written here.
+/// The key of a form of another language, and how to write it here.
 fn foreign_form(entries: &[Entry]) -> Option<(&Entry, &'static str)> {
     let here = |entry: &Entry| FOREIGN_FORMS.iter().find(|(other, _)| *other == entry.key).map(|(_, here)| *here);
     entries.iter().find_map(|entry| Some((entry, here(entry)?)))
@@ -64,38 +64,38 @@ pub(crate) struct Outline<'a> {
     pub(crate) steps: Vec<Step<'a>>,
 }
 
-/// A step of the file: a state to be.
+/// A step of the file, which becomes a state.
 #[derive(Debug)]
 pub(crate) struct Step<'a> {
     pub(crate) name: String,
     pub(crate) path: String,
     pub(crate) parent: Option<StateId>,
-    /// Its siblings are the steps of the same parent and branch.
+    /// The list of the parent; siblings have the same parent and branch.
     pub(crate) branch: Branch,
     pub(crate) form: Form<'a>,
-    /// What is done before it is tried again.
+    /// `retry: {before: …}`.
     pub(crate) before: Vec<StateId>,
-    /// What is done on every way out of it.
+    /// `finally: […]`.
     pub(crate) finally: Vec<StateId>,
     /// Its mapping.
     pub(crate) body: &'a Node,
     pub(crate) at: Location,
 }
 
-/// Which of its parent's lists a step stands in.
+/// The list of its parent that a step is in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Branch {
-    /// The only one, or `then`.
+    /// The only list, or `then`.
     First,
     /// `else`
     Otherwise,
-    /// `retry: {before: …}`: in none of its lists, and not inside of it.
+    /// `retry: {before: …}`: in none of the parent's lists, and not inside of the parent.
     Before,
     /// `finally: […]`: the same.
     Finally,
 }
 
-/// What a step is.
+/// The form of a step.
 #[derive(Debug)]
 pub(crate) enum Form<'a> {
     Action {
@@ -128,14 +128,14 @@ pub(crate) enum Form<'a> {
     Library {
         file: &'a Node,
     },
-    /// The executive waits itself; or it asks an operator.
+    /// The executive itself waits or asks an operator.
     Wait {
         node: &'a Node,
         asks: bool,
     },
 }
 
-/// When the predicate of a loop is looked at, and what ends the loop.
+/// When the predicate of a loop is tested, and which result ends the loop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Tests {
     /// `while`: before each iteration; false ends it.
@@ -151,7 +151,7 @@ pub(crate) enum Tests {
 pub(crate) struct Header<'a> {
     /// The whole text.
     pub(crate) node: &'a Node,
-    /// The part behind `in`.
+    /// The part after `in`.
     pub(crate) collection: String,
     /// Where that part begins in the text, in characters.
     pub(crate) offset: usize,
@@ -181,15 +181,14 @@ impl Outline<'_> {
         self.step(id).branch == Branch::First && self.step(id).parent.is_some_and(is_concurrency)
     }
 
-    /// The step and those around it, innermost first.
+    /// The step and the steps around it, innermost first.
     pub(crate) fn around(&self, id: StateId) -> impl Iterator<Item = StateId> + '_ {
         std::iter::successors(Some(id), |id| self.step(*id).parent)
     }
 }
 
 impl Outline<'_> {
-    /// The states that a step is inside of, innermost first. What is done before another try of a state, or on every way out of it, is not
-    /// inside of that state.
+    /// The states that contain a step, innermost first. The steps of `retry: {before: …}` and `finally` are not inside of their state.
     pub(crate) fn containers(&self, id: StateId) -> impl Iterator<Item = StateId> + '_ {
         std::iter::successors(self.container(id), |id| self.container(*id))
     }
@@ -204,12 +203,12 @@ impl Outline<'_> {
 }
 
 impl<'a> Step<'a> {
-    /// Whether it is what a `switch` becomes from its second case on: the only state of the branch, a condition called `else`.
+    /// Whether this is how a further case of a `switch` is expanded: the only state of the branch, a condition named `else`.
     pub(crate) fn is_next_case(&self, branch: &[StateId]) -> bool {
         branch.len() == 1 && self.name == "else" && matches!(self.form, Form::Condition { .. })
     }
 
-    /// What must hold as long as it goes on: `while` beside what the step is.
+    /// The `while` conditions beside another form.
     pub(crate) fn holds(&self) -> Option<&'a Node> {
         match self.form {
             Form::While { tests: Tests::Before, .. } => None,
@@ -316,7 +315,7 @@ impl<'a> Builder<'a, '_> {
     /// The name of a step, if it has one, and its mapping.
     fn named(&mut self, item: &'a Node, path: &str) -> Option<(Option<String>, Location, &'a Node)> {
         let entries = item.entries();
-        // `- tuck:` with what belongs to it in the same column: the name is a key without a value.
+        // `- tuck:` with its keys in the same column: the name is a key without a value.
         if let [name, rest @ ..] = entries
             && rest.iter().any(is_form)
             && !is_form(name)
@@ -392,7 +391,7 @@ impl<'a> Builder<'a, '_> {
     ) -> Option<StateId> {
         let mut forms: Vec<&Entry> = body.entries().iter().filter(|e| FORMS.contains(&e.key.as_str())).collect();
         if forms.len() > 1 {
-            // Beside another form it says what must hold meanwhile.
+            // Beside another form, `while` gives conditions that must hold meanwhile.
             forms.retain(|form| form.key != "while");
         }
         let [form] = forms.as_slice() else {
@@ -496,7 +495,7 @@ impl<'a> Builder<'a, '_> {
     }
 }
 
-/// The name of a loop or a condition that was given none.
+/// The name of a loop or a condition without a given name.
 fn default_name(body: &Node) -> String {
     match body.get("for").map(|node| &node.content) {
         Some(Content::Text(text)) => format!("for_{}", text.split_whitespace().next().unwrap_or("each")),

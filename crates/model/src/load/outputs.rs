@@ -1,10 +1,10 @@
-//! `outputs` of the states that contain others: what is seen of the inside when the state has ended.
+//! Reads `outputs` of composite states: the values of inner states that are visible after the state has ended.
 //!
 //! ```text
 //! outputs:
 //!   way: either(drive.way, reach.way)              the first that was written
-//!   seen: { value: look.boxes, default: [] }       the default where the value was not written, or the state has not run
-//!   all: { each: look.boxes, type: list<any> }     of a loop: a list with a value of each iteration
+//!   seen: { value: look.boxes, default: [] }       the default if the value was not written, or the state has not run
+//!   all: { each: look.boxes, type: list<any> }     in a loop: a list with one value per iteration
 //! ```
 
 use super::fields::Fields;
@@ -18,7 +18,7 @@ use crate::program::TaskOutput;
 use crate::value::{Type, Value};
 use std::collections::BTreeMap;
 
-/// Whether an output is written with more than its value.
+/// Whether an output is written as a mapping.
 pub(crate) fn is_long(node: &Node) -> bool {
     node.get("value").is_some() || node.get("each").is_some()
 }
@@ -59,7 +59,7 @@ pub(crate) fn read(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> Vec<TaskOutp
     outputs
 }
 
-/// Where the value of an output was not written, it is the default.
+/// Adds defaults: an output whose value was not written has its default.
 pub(crate) fn with_defaults(outputs: &mut [TaskOutput], defaults: &BTreeMap<String, Value>) {
     for output in outputs.iter_mut().filter(|output| !output.value.flows().is_empty()) {
         if let Some(default) = defaults.get(&output.name) {

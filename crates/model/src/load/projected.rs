@@ -1,11 +1,11 @@
-//! Who looks at the world gets a projection of it. What computes or senses may begin before older states have ended: without one it would see the
-//! world in which their effects are still missing. So a state that reads facts blocks room for a projection, whether or not anybody says so.
+//! Implied projections. A computing or sensing state may begin before older states have ended; without a projection it would see a world without
+//! their effects. So a state that reads facts blocks room for a projection, even if the file does not say so.
 
 use crate::id::StateId;
 use crate::program::{Annotations, Nature, Origin, ResourceExpr, State, StateKind, WORLD_MODEL};
 use crate::resource::ResourceOperation;
 
-/// Adds the block of every state that looks at the world and has none, its own or of a state around it.
+/// Adds this block to every state that reads facts and has none, neither its own nor from a state around it.
 pub(super) fn imply(states: &mut [State]) {
     let looks: Vec<StateId> =
         states.iter().filter(|state| looks_at_root(states, state)).map(|state| state.id).collect();
@@ -16,7 +16,7 @@ pub(super) fn imply(states: &mut [State]) {
     }
 }
 
-/// Whether it may begin ahead of its place and read facts, without a projection.
+/// Whether the state may begin ahead of its place and reads facts without a projection.
 fn looks_at_root(states: &[State], state: &State) -> bool {
     let is_ahead = matches!(state.kind, StateKind::Action { .. }) && state.annotations.nature != Nature::Irreversible;
     let around = std::iter::successors(Some(state), |one| one.parent.map(|id| &states[id.0 as usize]));

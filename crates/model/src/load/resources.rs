@@ -23,7 +23,7 @@ const CLASSES: [(&str, ResourceClass); 5] = [
     ("task", ResourceClass::Task),
 ];
 
-/// The lines of `resources`; what does not read is left out (and was complained of).
+/// Reads the lines of `resources`; a line that cannot be parsed is reported and left out.
 pub(crate) fn list(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<ResourceExpr> {
     let mut resources = Vec::new();
     for item in node.items() {

@@ -1,4 +1,4 @@
-//! A step of the outline → a state: its kind with every expression read, and its annotations.
+//! A step of the outline → a state: its kind with all expressions, and its annotations.
 
 use super::action::Sources;
 use super::fields::{Fields, Output};
@@ -22,7 +22,7 @@ const CONDITION_KEYS: [&str; 4] = ["condition", "then", "else", "outputs"];
 const CONCURRENCY_KEYS: [&str; 4] = ["concurrency", "regions", "decide", "outputs"];
 const LIBRARY_KEYS: [&str; 2] = ["library", "with"];
 const WAIT_KEYS: [&str; 2] = ["wait", "ask"];
-/// A state that waits reads what it says, holds nothing and changes nothing.
+/// Keys of a state that waits; it holds no resources and changes nothing.
 const WAITING_KEYS: [&str; 7] = ["retry", "duration", "description", "transitions", "exceptional", "assign", "shared"];
 const NODE_KEYS: [&str; 14] = [
     "retry",
@@ -180,7 +180,7 @@ fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {
             StateKind::Concurrency { regions: regions.clone(), preemptive, successes, decide, outputs }
         }
         Form::Wait { node, asks } => wait::kind(fields, node, *asks),
-        // Its states are put below it when all states are there.
+        // The library's states are inserted below it when all states exist.
         Form::Library { .. } => StateKind::Sequence { children: Vec::new(), outputs: Vec::new() },
         Form::Condition { predicate, then, otherwise } => {
             fields.note("condition", predicate.at);
@@ -219,7 +219,7 @@ fn ports(fields: &Fields<'_, '_>) -> std::collections::BTreeMap<String, Type> {
     own.unwrap_or_default()
 }
 
-/// `out: {x: {type: int, default: 0}}`, and of a hierarchy `outputs: {x: {value: plan.n, default: 0}}`.
+/// Reads defaults: `out: {x: {type: int, default: 0}}`, and for a hierarchy `outputs: {x: {value: plan.n, default: 0}}`.
 fn defaults(fields: &mut Fields<'_, '_>, body: &Node) -> std::collections::BTreeMap<String, Value> {
     let mut defaults = std::collections::BTreeMap::new();
     let of_action = body.get("out").map(Node::entries).unwrap_or_default();
@@ -235,7 +235,7 @@ fn defaults(fields: &mut Fields<'_, '_>, body: &Node) -> std::collections::BTree
             }
             defaults.insert(entry.key.clone(), value);
         }
-        // Before the first iteration there is nothing of any.
+        // Before the first iteration the list is empty.
         if entry.value.get("each").is_some() {
             defaults.entry(entry.key.clone()).or_insert_with(|| Value::List(List::new()));
         }
@@ -243,7 +243,7 @@ fn defaults(fields: &mut Fields<'_, '_>, body: &Node) -> std::collections::BTree
     defaults
 }
 
-/// Of a state that contains others: it reads and changes nothing beside what they do, and what its own keys say.
+/// Annotations of a composite state: it reads and changes nothing besides what its parts do and its own keys declare.
 fn boundary(reads: Vec<FactExpr>) -> Annotations {
     let effects = [(SUCCESS.to_owned(), Vec::new())].into();
     Annotations { reads: Some(reads), effects, ..Annotations::default() }
@@ -268,7 +268,7 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
     if read.is_some() {
         annotations.reads = read;
     } else if matches!(annotations.nature, Nature::Senses(_)) {
-        // What a sensing state reads is what it senses.
+        // A sensing state reads the facts that it senses.
         annotations.reads = Some(Vec::new());
     }
     annotations.requires = sources.read_each(fields, "requires", |fields, node| {
@@ -278,7 +278,7 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
         };
         node.items().into_iter().enumerate().filter_map(required).collect()
     });
-    // States that cannot change the environment change nothing when they fail, and computing alone changes nothing at all.
+    // States that cannot change the environment change nothing when they fail; a computing state never changes anything.
     if annotations.nature != Nature::Irreversible {
         for outcome in [ABORTED, PREEMPTED] {
             annotations.effects.insert(outcome.to_owned(), Vec::new());
@@ -292,7 +292,7 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
         }
     }
     let changed = sources.effects(fields, |fields, node| {
-        // As it ends, what a hierarchy contains has written its outputs.
+        // At the end of a hierarchy the outputs of its children are visible.
         fields.view.inside = matches!(kind, StateKind::Sequence { .. } | StateKind::Concurrency { .. });
         fields.view.own_outputs = true;
         let changed = effects::by_outcome(fields, node);
@@ -302,7 +302,7 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
     });
     annotations.effects.extend(changed);
     let resources = sources.read(fields, "resources", |fields, node| {
-        // What is created may be named by what the state put out; blocks are checked against that.
+        // A created resource may use the state's outputs; blocks must not, which is checked separately.
         fields.view.own_outputs = true;
         let resources = resources::list(fields, node);
         fields.view.own_outputs = false;
@@ -356,7 +356,7 @@ fn nature(fields: &mut Fields<'_, '_>, body: &Node) -> Nature {
     }
 }
 
-/// `scene` stands for the facts that geometry is derived from: those that the ontology says, where there is one.
+/// `scene` stands for the facts from which the geometry is derived: those of the ontology, if there is one.
 fn reads(fields: &mut Fields<'_, '_>, item: &Node) -> Vec<FactExpr> {
     if !matches!(&item.content, Content::Text(text) if text == "scene") {
         return fields.fact(item).into_iter().collect();

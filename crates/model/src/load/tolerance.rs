@@ -1,7 +1,7 @@
-//! `tolerance` of a task: which difference between a predicted and a measured value is none.
+//! Reads `tolerance` of a task: the difference within which a measured value counts as the predicted one.
 //!
-//! One number (for numbers and joints), or `{number, position, angle, predicates: {name: the same}}`. What an ontology says of
-//! its predicates counts where the task says nothing of them.
+//! One number (for numbers and joints), or `{number, position, angle, predicates: {name: the same}}`. The ontology's
+//! tolerances hold for predicates that the task does not mention.
 
 use super::fields::Fields;
 use super::names::suggestion;

@@ -1,4 +1,4 @@
-//! `wait: {…}` and `ask: {…}`: states that the executive waits in itself.
+//! Reads `wait: {…}` and `ask: {…}`: states in which the executive itself waits.
 
 use super::fields::Fields;
 use super::flow;
@@ -13,12 +13,12 @@ use std::collections::BTreeMap;
 
 const WAIT_FOR_KEYS: [&str; 5] = ["for", "seconds", "until", "signal", "timeout"];
 const QUESTION_KEYS: [&str; 4] = ["question", "choices", "default", "timeout"];
-/// What a wait may be for.
+/// Keys for what is waited for.
 const FORMS: [&str; 4] = ["for", "seconds", "until", "signal"];
-/// More choices than this are no question.
+/// Limit of choices.
 const MAX_CHOICES: usize = 32;
 
-/// The output port that such a state has.
+/// The output port of such a state.
 pub(crate) fn ports(node: &Node, asks: bool) -> BTreeMap<String, Type> {
     if asks {
         BTreeMap::from([(ANSWER.to_owned(), Type::String)])
@@ -29,7 +29,7 @@ pub(crate) fn ports(node: &Node, asks: bool) -> BTreeMap<String, Type> {
     }
 }
 
-/// The outcomes that such a state has of its own: the choices that its transitions name, and the end of its time.
+/// The outcomes of such a state: the choices that its transitions name, and the timeout.
 pub(crate) fn outcomes(step: &Step<'_>, node: &Node, asks: bool) -> Vec<String> {
     let connected = step.body.get("transitions").map(Node::entries).unwrap_or_default();
     let choices = node.get("choices").filter(|_| asks).into_iter().flat_map(Node::items).filter_map(as_text);
@@ -48,7 +48,7 @@ fn as_text(node: &Node) -> Option<&str> {
     }
 }
 
-/// The action that such a state is.
+/// The action of such a state.
 pub(crate) fn kind(fields: &mut Fields<'_, '_>, node: &Node, asks: bool) -> StateKind {
     let (form, example) = if asks {
         ("ask", "write `ask: { question: \"Go on?\", choices: [go, stop] }`")
@@ -106,7 +106,7 @@ fn question(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<(String, Expr)> {
     fields.keys(node, &QUESTION_KEYS);
     let mut inputs = Vec::new();
     match node.get("question") {
-        // A sentence is a text; what reads as an expression is one only where it says so.
+        // A plain sentence is a text; an expression must be recognizable as one.
         Some(text) => {
             fields.note("in.question", text.at);
             let question = match &text.content {
@@ -158,12 +158,12 @@ fn question(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<(String, Expr)> {
     inputs
 }
 
-/// Whether a question is an expression: it begins with a quote, a variable or a function that makes text.
+/// Whether a question is an expression: it begins with a quote, a variable or a function that returns text.
 fn is_expression(sentence: &str) -> bool {
     sentence.starts_with(['\'', '"', '$']) || sentence.starts_with("concat(")
 }
 
-/// It changes nothing; while it waits for a condition, what that says outright is foreseen.
+/// The annotations: it changes nothing, but foresees the facts that its condition states literally.
 pub(crate) fn annotations(
     fields: &mut Fields<'_, '_>,
     step: &Step<'_>,
@@ -178,7 +178,7 @@ pub(crate) fn annotations(
     {
         effects.insert(SUCCESS.to_owned(), foreseen(condition));
     }
-    // How long that takes is known.
+    // The duration of this wait is known.
     let duration_s = match kind {
         StateKind::Action { action, inputs, .. } if action == SECONDS => {
             inputs.first().map(|(_, seconds)| seconds.clone())

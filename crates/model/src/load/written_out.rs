@@ -1,4 +1,4 @@
-//! `switch`, `fallback` and regions that are alike: forms that are other forms in fewer words. They are written out before anything else is read.
+//! `switch`, `fallback` and similar regions: short forms, which are expanded into other forms before anything else is read.
 //!
 //! ```text
 //! switch: look.kind              condition: (look.kind) = cup
@@ -24,19 +24,19 @@ use crate::parameters::constant;
 use crate::program::{ABORTED, SUCCESS};
 use crate::value::Value;
 
-/// A switch has at most so many cases: each is a condition in the one before.
+/// Limit of the cases of a switch; each is a condition nested in the one before.
 const MAX_CASES: usize = 24;
 
-/// So many regions that are alike are written out at the most.
+/// Limit of the regions made by `for`.
 const MAX_REGIONS: usize = 64;
 
-/// Keys of a state below which there are lists of states.
+/// Keys with lists of states below.
 const LISTS: [&str; 9] = ["states", "do", "then", "else", "regions", "default", "fallback", "before", "finally"];
 
 /// Forms whose `index` is a variable.
 const LOOPS: [&str; 4] = ["for", "while", "do_while", "until"];
 
-/// Writes out what stands in a list of states, and in all lists within.
+/// Expands a list of states, and all lists inside.
 pub(crate) fn write_out(list: &mut Node, findings: &mut Findings) {
     let Content::List(items) = &mut list.content else { return };
     for item in items {
@@ -44,7 +44,7 @@ pub(crate) fn write_out(list: &mut Node, findings: &mut Findings) {
     }
 }
 
-/// A state: a mapping with its keys, or one of its name to that.
+/// Expands a state: a mapping with its keys, or with its name and such a mapping.
 fn state(node: &mut Node, name: &str, findings: &mut Findings) {
     if node.get("switch").is_some() && (node.get("cases").is_some() || node.entries().len() == 1) {
         switch(node, name, findings);
@@ -69,7 +69,7 @@ fn state(node: &mut Node, name: &str, findings: &mut Findings) {
     }
 }
 
-/// Conditions in each other: one for each case.
+/// Expands a switch: nested conditions, one per case.
 fn switch(node: &mut Node, name: &str, findings: &mut Findings) {
     let at = node.at;
     let Some(entries) = taken(node) else { return };
@@ -118,7 +118,7 @@ fn switch(node: &mut Node, name: &str, findings: &mut Findings) {
             );
             continue;
         };
-        // Where it stands in the file is where the switch stands.
+        // The location is that of the case, in the file.
         let condition = Node { at: case.at, offset: None, content: Content::Text(format!("({text}) = {value}")) };
         let entry = |key: &str, value: Node| Entry { key: key.to_owned(), at: case.at, value };
         let mut condition = vec![entry("condition", condition), entry("then", case.value), entry("else", otherwise)];
@@ -145,7 +145,7 @@ fn value(key: &str) -> Option<String> {
     (!key.contains(['"', '\\', '\n'])).then(|| format!("\"{key}\""))
 }
 
-/// States of which each leads to the next when it fails, and out by success.
+/// Expands a fallback: each state leads to the next if it fails, and out by success.
 fn fallback(node: &mut Node, name: &str, findings: &mut Findings) {
     let at = node.at;
     let Content::Map(entries) = &mut node.content else { return };
@@ -203,7 +203,7 @@ fn fallback(node: &mut Node, name: &str, findings: &mut Findings) {
     }
 }
 
-/// Regions that differ in the value of a variable.
+/// Expands similar regions, which differ in the value of a variable.
 fn alike(node: &mut Node, name: &str, findings: &mut Findings) {
     let at = node.at;
     let Some(entries) = taken(node) else { return };
@@ -253,13 +253,13 @@ fn alike(node: &mut Node, name: &str, findings: &mut Findings) {
     node.content = Content::List(values.iter().enumerate().map(region).collect());
 }
 
-/// A value as it can stand wherever a variable can.
+/// A constant as text that can replace a variable anywhere.
 fn constant_text(value: &Value) -> String {
     let is_plain = value.as_number().is_some_and(|number| number >= 0.0);
     if is_plain { value.to_string() } else { format!("({value})") }
 }
 
-/// Whether a text says `map($name in …`, or the same of another function of elements.
+/// Whether a text contains `map($name in …` or another comprehension with this element.
 fn is_element(text: &str, variable: &str) -> bool {
     let name = format!("${variable}");
     text.match_indices(&name).any(|(at, _)| {
@@ -293,7 +293,7 @@ fn binds(node: &Node, variable: &str) -> bool {
     }
 }
 
-/// A node with a text in place of a variable, in keys and values.
+/// The node with a text in place of a variable, in keys and values.
 fn with(node: &Node, variable: &str, text: &str) -> Node {
     let entry = |one: &Entry| {
         let (key, value) = (replaced(&one.key, variable, text), with(&one.value, variable, text));
@@ -323,7 +323,7 @@ fn replaced(old: &str, variable: &str, text: &str) -> String {
     new + rest
 }
 
-/// The name of a state of a list, where it has one.
+/// The name of a state in a list, if it has one.
 pub(super) fn named(item: &Node) -> Option<&str> {
     match item.entries() {
         [entry] if matches!(entry.value.content, Content::Map(_)) => Some(&entry.key),
@@ -338,7 +338,7 @@ fn taken(node: &mut Node) -> Option<Vec<Entry>> {
     }
 }
 
-/// What is refused is a state without states.
+/// Replaces a refused state by one without children.
 fn empty(node: &mut Node, mut rest: Vec<Entry>) {
     let value = Node { at: node.at, offset: None, content: Content::List(Vec::new()) };
     rest.push(Entry { key: "states".to_owned(), at: node.at, value });

@@ -1,28 +1,26 @@
-//! YAML text → a tree of nodes that know where they stand. The only place that knows the YAML library.
+//! YAML text → a tree of nodes with their locations. The only module that uses the YAML library.
 //!
-//! Booleans are `true` and `false` only: a state may be called `no`. Duplicate keys, several documents and files beyond
-//! [`MAX_SOURCE`] are refused; the library bounds depth and aliases.
+//! Booleans are `true` and `false` only, because a state may be named `no`. Duplicate keys, several documents and files
+//! larger than [`MAX_SOURCE`] are refused; the library limits depth and aliases.
 
 use crate::program::Location;
 use serde::de::{Deserialize, Deserializer, MapAccess, SeqAccess, Visitor};
 use serde_saphyr::Spanned;
 use std::fmt;
 
-/// The largest task file, in bytes.
+/// Limit of a task file, in bytes.
 pub const MAX_SOURCE: usize = 1 << 20;
 
 /// A YAML node.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Node {
-    /// Where it begins.
     pub(crate) at: Location,
     /// Byte offset of its beginning in the source.
     pub(crate) offset: Option<usize>,
-    /// What it is.
     pub(crate) content: Content,
 }
 
-/// What a node is.
+/// The content of a node.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Content {
     Null,
@@ -42,7 +40,7 @@ pub(crate) struct Entry {
     pub(crate) value: Node,
 }
 
-/// Text that is no YAML.
+/// Error: the text is no YAML.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct InvalidYaml {
     pub(crate) at: Location,
@@ -57,7 +55,7 @@ pub(crate) fn read(source: &str) -> Result<Node, InvalidYaml> {
     }
     let mut options = serde_saphyr::Options::default();
     options.strict_booleans = true;
-    // `!hand_empty(gripper)` without quotes would be a tag of nothing, and a condition that never holds.
+    // `!hand_empty(gripper)` without quotes would be a YAML tag without a value, and so a condition that never holds.
     options.reject_unsupported_tags = true;
     options.with_snippet = false;
     match serde_saphyr::from_str_with_options::<Spanned<Content>>(source, options) {
@@ -76,7 +74,7 @@ pub(crate) fn read(source: &str) -> Result<Node, InvalidYaml> {
     }
 }
 
-/// Where a `!` stands alone before a value: to YAML it says nothing, to its writer the contrary.
+/// The location of a single `!` before a value: YAML ignores it, but the author means a negation.
 fn negated(node: &Node, source: &str) -> Option<Location> {
     let before = node.offset.and_then(|offset| source.get(..offset)).unwrap_or_default();
     let own = node.offset.and_then(|offset| source.get(offset..)).unwrap_or_default();
@@ -90,7 +88,7 @@ fn negated(node: &Node, source: &str) -> Option<Location> {
     }
 }
 
-/// The library's message without the place, which is said before it, and without advice to programmers.
+/// The library's message without the location, which is reported separately, and without advice for programmers.
 fn message(text: &str) -> String {
     let line = text.lines().next().unwrap_or("unreadable");
     if line.contains("recursion limit exceeded") || line.contains("budget breached: Depth") {
@@ -104,7 +102,7 @@ fn message(text: &str) -> String {
 }
 
 impl Node {
-    /// What kind of node it is, for messages.
+    /// The kind of node, for messages.
     pub(crate) fn described(&self) -> &'static str {
         match self.content {
             Content::Null => "nothing",
@@ -121,7 +119,7 @@ impl Node {
         self.entries().iter().find(|entry| entry.key == key).map(|entry| &entry.value)
     }
 
-    /// The entries of a mapping; none for anything else.
+    /// The entries of a mapping; empty for anything else.
     pub(crate) fn entries(&self) -> &[Entry] {
         match &self.content {
             Content::Map(entries) => entries,
@@ -129,7 +127,7 @@ impl Node {
         }
     }
 
-    /// The items of a list; a single value counts as a list of itself, nothing as the empty list.
+    /// The items of a list; a single value counts as a list of one, a missing value as the empty list.
     pub(crate) fn items(&self) -> Vec<&Node> {
         match &self.content {
             Content::List(items) => items.iter().collect(),
@@ -138,8 +136,8 @@ impl Node {
         }
     }
 
-    /// Where the character `offset` of a text stands in the file: exactly if the text stands there as it reads (plain, or
-    /// quoted without escapes, on one line), else where the node begins.
+    /// The location in the file of the character `offset` of a text: exact if the file contains the text as it is (plain,
+    /// or quoted without escapes, on one line), else the beginning of the node.
     pub(crate) fn place_in_text(&self, source: &str, offset: usize) -> Location {
         let (Content::Text(text), Some(begin)) = (&self.content, self.offset) else { return self.at };
         let Some(raw) = source.get(begin..) else { return self.at };
@@ -255,7 +253,7 @@ mod tests {
             assert!(error.at.line >= 1 && !error.message.is_empty(), "{source}: {error:?}");
         }
         assert!(read(&"[".repeat(5_000)).is_err());
-        // What the library says of its own limits is said in the words of a task file.
+        // The library's limits are reported in the words of a task file.
         for limit in ["recursion limit exceeded", "budget breached: Depth { depth: 65 } at line 1, column 3"] {
             assert!(message(limit).contains("nested deeper"), "{limit}");
         }

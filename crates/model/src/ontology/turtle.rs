@@ -7,17 +7,17 @@
 //! @prefix : <urn:my-robot#> .
 //!
 //! :Object a owl:Class .
-//! :Box a owl:Class ; rdfs:subClassOf :Object ; ratn:named "box_" .      # whatever is called so is one
+//! :Box a owl:Class ; rdfs:subClassOf :Object ; ratn:named "box_" .      # names with this prefix are boxes
 //! :table a :Object .                                                    # an individual
 //! :at a ratn:Predicate ; ratn:arguments ( :Object ) ; ratn:value "pose" .
 //! :weight a ratn:Predicate ; ratn:arguments ( :Object ) ; ratn:value "float" ; ratn:unit "kg" ; ratn:tolerance 0.05 .
 //! ```
 //! A name in a task is the part of an IRI after its last `#`, `/` or `:`. An argument is a class, `owl:Thing` (anything) or
-//! `xsd:integer`; a value is a type in the words of task files, or a class: then it is the name of an individual. What else a
-//! predicate may say is in [`said`]. Labels and comments are for people; any other property is refused, as it would say
-//! something that is not checked. What an ontology imports is read with it ([`imports`]).
+//! `xsd:integer`. A value is a type in the words of task files, or a class: then it is the name of an individual. Further
+//! properties of predicates are in [`said`]. Labels and comments are for people; any other property is refused, because it
+//! would not be checked. Imported ontologies are read, too ([`imports`]).
 //!
-//! Reading is bounded: by the size of the text, by the number of statements, and by a check for circles among subclasses.
+//! Reading is bounded by the size of the text and by the number of statements; circular subclasses are refused.
 
 pub mod imports;
 pub mod said;
@@ -29,64 +29,64 @@ use oxrdf::{BlankNode, NamedOrBlankNode, Term as Node, Triple};
 use oxttl::TurtleParser;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// An ontology has no more statements.
+/// Limit of statements in an ontology.
 pub const MAX_STATEMENTS: usize = 20_000;
-/// An ontology has no more classes: what is above each of them is kept.
+/// Limit of classes in an ontology, because all superclasses of each class are stored.
 pub const MAX_CLASSES: usize = 1_000;
 
 const OURS: &str = "urn:ratn:ontology#";
 const OWL: &str = "http://www.w3.org/2002/07/owl#";
 
-/// A text that is no ontology.
+/// Error: the text is no ontology.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum OntologyError {
     /// Not Turtle.
     #[error("line {line}: {message}")]
     Syntax {
-        /// Where, from 1.
+        /// The line, counted from 1.
         line: u64,
-        /// What is wrong there.
+        /// What is wrong.
         message: String,
     },
-    /// More than is read.
+    /// The ontology exceeds a limit.
     #[error("it is too large: at most {limit} {of} are read")]
     TooLarge {
-        /// How much is read.
+        /// The limit.
         limit: usize,
         /// Of what.
         of: &'static str,
     },
-    /// In a file that it imports.
+    /// An error in an imported file.
     #[error("{file}")]
     Import {
-        /// What it is called where it is imported.
+        /// The file's name in the import.
         file: String,
         /// What is wrong there.
         source: Box<OntologyError>,
     },
-    /// A statement that is not understood, or contradicts another.
+    /// A statement is not understood, or contradicts another one.
     #[error("`{subject}`: {message}")]
     Statement {
-        /// The name of what it is about.
+        /// The name of its subject.
         subject: String,
         /// What is wrong.
         message: String,
     },
 }
 
-/// What is said of one subject, in the order of the text.
+/// The statements about each subject, in the order of the text.
 type Statements = BTreeMap<String, Vec<(String, Node)>>;
 
-/// Reads an ontology of one text, which imports nothing.
+/// Reads an ontology from one text without imports.
 ///
 /// # Errors
-/// [`OntologyError`] for the first thing that is wrong.
+/// [`OntologyError`] for the first error.
 pub fn read(text: &str) -> Result<Ontology, OntologyError> {
     let nothing = |_: &str, _: &str| Err("there are no other files here".to_owned());
     imports::read_with("", text, &nothing).map(|(ontology, _)| ontology)
 }
 
-/// What one text says, the `number`th of an ontology in which `before` statements were read already.
+/// The statements of one text, the `number`th of an ontology of which `before` statements have been read.
 fn parse(text: &str, number: usize, before: usize) -> Result<Statements, OntologyError> {
     if text.len() > MAX_SOURCE {
         return Err(OntologyError::TooLarge { limit: MAX_SOURCE, of: "bytes" });
@@ -102,7 +102,7 @@ fn parse(text: &str, number: usize, before: usize) -> Result<Statements, Ontolog
         if before + place >= MAX_STATEMENTS {
             return Err(OntologyError::TooLarge { limit: MAX_STATEMENTS, of: "statements" });
         }
-        // A blank node is known within its text only.
+        // A blank node is local to its text.
         let object = match object {
             Node::BlankNode(blank) => Node::BlankNode(BlankNode::new_unchecked(own(&blank, number))),
             other => other,
@@ -116,7 +116,7 @@ fn parse(text: &str, number: usize, before: usize) -> Result<Statements, Ontolog
     Ok(statements)
 }
 
-/// The ontology that all statements make.
+/// Makes the ontology of all statements.
 fn assemble(statements: &Statements) -> Result<Ontology, OntologyError> {
     let reader = Reader { statements };
     reader.names_are_unique()?;
@@ -168,7 +168,7 @@ impl Reader<'_> {
         Ok(ontology)
     }
 
-    /// What a name stands for would otherwise depend on the order of the text.
+    /// Names must be unique; else their meaning would depend on the order of the text.
     fn names_are_unique(&self) -> Result<(), OntologyError> {
         let mut seen: BTreeMap<String, &str> = BTreeMap::new();
         for subject in self.statements.keys().filter(|subject| !subject.starts_with("_:")) {
@@ -221,7 +221,7 @@ impl Reader<'_> {
         Ok(classes)
     }
 
-    /// The elements of a list; a list has at most as many as there are statements.
+    /// The elements of a list; it has at most as many as there are statements.
     fn arguments(&self, subject: &str, list: &Node) -> Result<Vec<Domain>, OntologyError> {
         let mut arguments = Vec::new();
         let mut rest = list.clone();
@@ -255,7 +255,7 @@ impl Reader<'_> {
         text.parse().map(Range::Type).map_err(|error| wrong(subject, error))
     }
 
-    /// The name of a class that the text declares.
+    /// The name of a declared class.
     fn class(&self, subject: &str, object: &Node) -> Result<String, OntologyError> {
         match object {
             Node::NamedNode(iri) if self.statements.get(iri.as_str()).is_some_and(|said| is_any(said, &classes())) => {
@@ -266,7 +266,7 @@ impl Reader<'_> {
     }
 }
 
-/// Every class with all that are above it, by depth-first search with a stack of its own.
+/// Every class with all its superclasses, by depth-first search with an explicit stack.
 fn closure(above: &BTreeMap<String, BTreeSet<String>>) -> Result<BTreeMap<String, BTreeSet<String>>, OntologyError> {
     if above.len() > MAX_CLASSES {
         return Err(OntologyError::TooLarge { limit: MAX_CLASSES, of: "classes" });

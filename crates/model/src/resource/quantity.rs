@@ -1,7 +1,8 @@
-//! How much of a resource: an exact decimal number, so that what is taken and given back in parts adds up.
+//! Amounts of a resource: exact decimal numbers, so that parts that are taken and given back add up exactly.
 //!
-//! For people, on the wire and in files it is a number with at most three decimals; inside and in the resource manager's log a
-//! whole number of thousandths. Anything else (negative, not a number, finer, too large) is refused where it comes in.
+//! For people, on the wire and in files an amount is a number with at most three decimals; internally and in the resource
+//! manager's log it is an integer number of thousandths. Anything else (negative, not a number, finer, too large) is refused
+//! on input.
 
 use serde::de::{self, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -11,56 +12,56 @@ use std::str::FromStr;
 /// Thousandths in a unit.
 const UNIT: u64 = 1_000;
 
-/// An amount of a resource in fixed-point units of a thousandth: `2` of something countable, `0.5` of something divisible.
+/// An amount of a resource in fixed-point units of a thousandth: `2` of an indivisible resource, `0.5` of a divisible one.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Quantity(u64);
 
-/// A number that is no quantity.
+/// Error: the number is no quantity.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum QuantityError {
-    /// Not a number, infinite, or a text that is none.
+    /// Not a number, infinite, or a text that is no number.
     #[error("is `{0}`: an amount is a number such as 2 or 0.5")]
     NotANumber(String),
     /// Below zero.
     #[error("is {0}: an amount is not negative")]
     Negative(f64),
-    /// With more decimals than three.
+    /// More than three decimals.
     #[error("is {0}: an amount has at most three decimals")]
     TooPrecise(f64),
-    /// More than can be counted.
+    /// Too large.
     #[error("is {0}: an amount is at most {max}", max = Quantity::MAX)]
     TooLarge(f64),
 }
 
 impl Quantity {
-    /// Nothing.
+    /// Zero.
     pub const ZERO: Quantity = Quantity(0);
     /// One whole unit.
     pub const ONE: Quantity = Quantity(UNIT);
-    /// The largest that is read; far below what a float or a sum of amounts would lose.
+    /// The largest amount that is accepted; far below the limits of exact floats and of sums.
     pub const MAX: Quantity = Quantity::whole(u32::MAX);
 
-    /// So many whole units.
+    /// A number of whole units.
     pub const fn whole(units: u32) -> Quantity {
         Quantity(units as u64 * UNIT)
     }
 
-    /// So many thousandths of a unit.
+    /// A number of thousandths of a unit.
     pub const fn from_thousandths(thousandths: u64) -> Quantity {
         Quantity(thousandths)
     }
 
-    /// In thousandths of a unit.
+    /// The amount in thousandths of a unit.
     pub const fn thousandths(self) -> u64 {
         self.0
     }
 
-    /// The whole units in it.
+    /// The number of whole units in it.
     pub fn units(self) -> u32 {
         u32::try_from(self.0 / UNIT).unwrap_or(u32::MAX)
     }
 
-    /// The whole units that it takes to have as much.
+    /// The amount in units, rounded up.
     pub fn units_up(self) -> u32 {
         u32::try_from(self.0.div_ceil(UNIT)).unwrap_or(u32::MAX)
     }
@@ -70,18 +71,18 @@ impl Quantity {
         self.0.is_multiple_of(UNIT)
     }
 
-    /// Whether it is nothing.
+    /// Whether it is zero.
     pub const fn is_zero(self) -> bool {
         self.0 == 0
     }
 
-    /// The largest multiple of `grain` in it.
+    /// Rounds down to a multiple of `grain`.
     #[must_use]
     pub fn floor_to(self, grain: Quantity) -> Quantity {
         Quantity(self.0 - self.0 % grain.0.max(1))
     }
 
-    /// The difference, or nothing where that would be negative.
+    /// The difference, or zero if it would be negative.
     #[must_use]
     pub const fn saturating_sub(self, other: Quantity) -> Quantity {
         Quantity(self.0.saturating_sub(other.0))
@@ -107,7 +108,7 @@ impl TryFrom<f64> for Quantity {
         if number > f64::from(Quantity::MAX) {
             return Err(QuantityError::TooLarge(number));
         }
-        // Exact: a decimal number is read as the float nearest to it, which this gives back.
+        // Exact: a decimal number is parsed as its nearest float, and this reproduces that float.
         let quantity = Quantity((number * UNIT as f64).round() as u64);
         if f64::from(quantity) == number { Ok(quantity) } else { Err(QuantityError::TooPrecise(number)) }
     }
@@ -182,7 +183,7 @@ impl<'de> Deserialize<'de> for Quantity {
     }
 }
 
-/// Reads a quantity as people write it.
+/// Deserializes a quantity as people write it.
 struct Number;
 
 impl Visitor<'_> for Number {

@@ -3,14 +3,14 @@
 
 use super::JobShop;
 
-/// No instance has more operations.
+/// Limit of the operations of an instance.
 pub const MAX_OPERATIONS: usize = 10_000;
 
-/// A text that is no instance.
+/// Error: the text is no instance.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("line {line}: {problem}")]
 pub struct InvalidJobShop {
-    /// Which line, from 1.
+    /// The line, counted from 1.
     pub line: usize,
     /// What is wrong, and what to write instead.
     pub problem: String,
@@ -24,9 +24,9 @@ fn wrong(line: usize, problem: String) -> InvalidJobShop {
 type Row<'a> = (usize, &'a str);
 
 impl JobShop {
-    /// Reads a text: a line with the numbers of jobs and machines (what follows on it is ignored), then a line per job with
-    /// pairs of machine (from 0) and duration; or Taillard's matrices. Lines that do not begin with a number, and empty ones, are
-    /// comments.
+    /// Parses a text: a line with the numbers of jobs and machines (the rest of the line is ignored), then a line per job with
+    /// pairs of machine (from 0) and duration; or Taillard's matrices. Empty lines, and lines that do not begin with a number,
+    /// are comments.
     ///
     /// # Errors
     /// [`InvalidJobShop`] names the first line that does not fit.
@@ -108,7 +108,7 @@ fn machine(line: usize, word: &str, machines: usize, first: usize) -> Result<usi
 }
 
 fn duration(line: usize, word: &str) -> Result<f64, InvalidJobShop> {
-    /// A longer one is not meant.
+    /// Limit of a duration, in seconds.
     const LONGEST_S: f64 = 1e6;
     let number = word.parse::<f64>().ok().filter(|duration| (0.0..=LONGEST_S).contains(duration));
     number.ok_or_else(|| wrong(line, format!("`{word}` is no duration from 0 to {LONGEST_S}")))

@@ -1,7 +1,7 @@
 //! Job shops: scheduling instances of the standard text format, as tasks.
 //!
-//! Every operation is an activity that needs its machine and waits for the job's operation before it. The task lists
-//! one job after the other, as its sequential program would do them.
+//! Every operation is an activity that needs its machine and waits for the operation before it in its job. The task
+//! lists one job after the other, as a sequential program would execute them.
 
 mod best_known;
 mod format;
@@ -14,14 +14,14 @@ use crate::activities::{Activities, Activity};
 /// An instance.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JobShop {
-    /// How many machines there are.
+    /// Number of machines.
     pub machines: usize,
-    /// Per job its operations in order: machine and duration.
+    /// Per job, its operations in order: machine and duration.
     pub jobs: Vec<Vec<(usize, f64)>>,
 }
 
 impl JobShop {
-    /// The operations as activities, one job after the other; each machine is a kind of which there is one.
+    /// The operations as activities, one job after the other; each machine is a resource kind with one unit.
     pub fn activities(&self) -> Activities {
         let mut activities = Vec::new();
         for (job, operations) in self.jobs.iter().enumerate() {

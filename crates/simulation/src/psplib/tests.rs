@@ -3,7 +3,7 @@
 use super::*;
 use crate::activities::Execution;
 
-/// Three jobs between source and sink, on two units of one resource and one of another.
+/// Three jobs between source and sink, with two units of one resource and one unit of another.
 const SMALL: &str = include_str!("../../../../tests/projects/small.sm");
 
 #[test]

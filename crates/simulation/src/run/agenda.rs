@@ -1,19 +1,19 @@
-//! What is going to happen in a simulated run, in the order of its moments; and of each attempt, what answers it.
+//! The agenda of a simulated run: future entries in the order of time, and by attempt the entries that answer it.
 
 use ratn_executive::protocol::Event;
 use ratn_model::id::{InstanceId, LeaseId};
 use ratn_model::time::Timestamp;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// What is going to happen.
+/// A future entry.
 pub(super) enum Entry {
-    /// This event.
+    /// An event for the executive.
     Event(Event),
     /// A resource of a lease vanishes, and the goal under it ends.
     Loss { lease: LeaseId, instance: InstanceId, attempt: u32 },
 }
 
-/// When, and the how manieth that was added.
+/// The time, and the number of the entry.
 type Place = (Timestamp, u64);
 
 #[derive(Default)]
@@ -24,13 +24,13 @@ pub(super) struct Agenda {
 }
 
 impl Agenda {
-    /// It happens at a moment, behind what happens then already.
+    /// Adds an entry at a time, after the entries at the same time.
     pub(super) fn add(&mut self, at: Timestamp, entry: Entry) {
         self.added += 1;
         self.put_back((at, self.added), entry);
     }
 
-    /// It happens at the place that it had.
+    /// Puts an entry back at its earlier place.
     pub(super) fn put_back(&mut self, place: Place, entry: Entry) {
         if let Some(attempt) = answered(&entry) {
             self.answers.entry(attempt).or_default().insert(place);
@@ -38,12 +38,11 @@ impl Agenda {
         self.entries.insert(place, entry);
     }
 
-    /// When something happens next.
     pub(super) fn next_at(&self) -> Option<Timestamp> {
         self.entries.first_key_value().map(|((at, _), _)| *at)
     }
 
-    /// What happens next.
+    /// Takes the next entry.
     pub(super) fn pop_first(&mut self) -> Option<(Timestamp, Entry)> {
         let (place, entry) = self.entries.pop_first()?;
         if let Some(attempt) = answered(&entry)
@@ -57,19 +56,17 @@ impl Agenda {
         Some((place.0, entry))
     }
 
-    /// Takes what answers an attempt.
     pub(super) fn take_answers(&mut self, instance: InstanceId, attempt: u32) -> Vec<(Place, Entry)> {
         let places = self.answers.remove(&(instance, attempt)).unwrap_or_default();
         places.into_iter().filter_map(|place| Some((place, self.entries.remove(&place)?))).collect()
     }
 
-    /// All of it, in order.
+    /// All entries, in order.
     pub(super) fn entries(&self) -> impl Iterator<Item = &Entry> {
         self.entries.values()
     }
 }
 
-/// The attempt that is answered, if one is.
 fn answered(entry: &Entry) -> Option<(InstanceId, u32)> {
     match entry {
         Entry::Event(

@@ -1,5 +1,5 @@
-//! Which units perform goals. A unit performs one goal at a time: where the executive gives it another one, a real provider refuses that as one
-//! too many, and the simulated run is broken.
+//! The units that perform goals. A unit performs one goal at a time. If the executive gives it a second one, a real provider would refuse it,
+//! and the simulated run fails.
 
 use ratn_executive::protocol::Goal;
 use ratn_model::id::{InstanceId, LeaseId, StateId};
@@ -9,11 +9,11 @@ use ratn_resources::Pool;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// The units that work, and for whom.
+/// The busy units.
 pub(super) struct Busy {
     program: Arc<Program>,
     states: BTreeMap<InstanceId, StateId>,
-    /// By unit: for whom, and under which lease.
+    /// By unit: instance, attempt and lease of its goal.
     goals: BTreeMap<String, (InstanceId, u32, LeaseId)>,
 }
 
@@ -26,7 +26,7 @@ impl Busy {
         self.states.insert(instance, state);
     }
 
-    /// A goal is given to the units that its state blocks; the other goal, where one of them performs that.
+    /// Gives a goal to the units that its state blocks; an error is the other goal of a unit that is busy.
     pub(super) fn begin(
         &mut self,
         pool: &Pool,
@@ -38,7 +38,7 @@ impl Busy {
         let blocks = self.program.state(*state).annotations.resources.iter();
         let blocks = blocks.filter(|line| line.operation == ResourceOperation::Block && line.kind != WORLD_MODEL);
         for unit in blocks.filter_map(|line| lease.resource(&line.kind)) {
-            // What several may hold at once performs no goals.
+            // Resources that several nodes may hold at once perform no goals.
             let is_shared = |id: &str| pool.get(id).is_some_and(|r| r.divisible || r.class == ResourceClass::World);
             if is_shared(&unit.id) {
                 continue;
@@ -52,12 +52,13 @@ impl Busy {
         Ok(())
     }
 
-    /// A goal has ended, or was told to stop.
+    /// A goal has ended or was cancelled.
     pub(super) fn end(&mut self, instance: InstanceId, attempt: u32) {
         self.goals.retain(|_, goal| (goal.0, goal.1) != (instance, attempt));
     }
 
-    /// A lease goes back; an error is the instance whose goal under it has neither ended nor been told to stop: nobody would tell it any more.
+    /// A lease is released. The error is the instance whose goal under it has neither ended nor been cancelled, because nobody would cancel it
+    /// any more.
     pub(super) fn given_back(&mut self, lease: LeaseId) -> Result<(), InstanceId> {
         let under_way = self.goals.values().find(|goal| goal.2 == lease).map(|goal| goal.0);
         self.goals.retain(|_, goal| goal.2 != lease);

@@ -1,8 +1,7 @@
-//! Circumstances of a simulated run besides its providers: what a user asks for, messages that come late or twice, answers that
+//! Circumstances of a simulated run besides its providers: events from outside, messages that arrive late or twice, answers that
 //! cross their cancellation.
 //!
-//! Which messages go wrong follows from a seed and from what they are about (path and attempt), never from the time: the same
-//! run has the same faults.
+//! Faults depend on a seed and on the subject of the message (path and attempt), never on time: the same run has the same faults.
 
 use crate::dice::Hash;
 use ratn_executive::protocol::{Event, Learned};
@@ -10,46 +9,47 @@ use ratn_model::value::Value;
 use std::collections::{BTreeMap, BTreeSet};
 use std::num::NonZeroUsize;
 
-/// More events than this is an endless run.
+/// Default limit of the events of a run.
 pub const MAX_EVENTS: usize = 1_000_000;
 
-/// What happens to a run beside what its providers do.
+/// The circumstances of a run besides its providers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Circumstances {
-    /// So many orders of what is still to be done are simulated whenever much of the window has changed; 0 is plain dispatch.
+    /// Number of orders that look-ahead simulates whenever much of the window has changed; 0 is plain dispatch.
     pub orders: usize,
-    /// More events than this is an endless run.
+    /// Limit of events.
     pub max_events: usize,
-    /// What comes from outside, and when.
+    /// Events from outside, with their triggers.
     pub events: Vec<(Trigger, Event)>,
-    /// How messages go wrong.
+    /// Faults of messages.
     pub mischief: Mischief,
-    /// What is checked after every event.
+    /// Checks after every event.
     pub checks: Checks,
-    /// After the last event of every moment it is checked that nobody could go on who was not woken; on a copy of the executive, so
-    /// that the run is the same without.
+    /// Whether to check, after the last event of every moment, that no instance was forgotten that could go on. The check uses a
+    /// copy of the executive, so the run does not change.
     pub examines: bool,
-    /// States that are refused whatever they ask for, by their paths without visits.
+    /// States whose acquires are always refused, by their paths without visits.
     pub refused: BTreeSet<String>,
-    /// After so many events the executive is thrown away, and another one made from the log goes on.
+    /// After this number of events the executive is replaced by a new one that is rebuilt from the log.
     pub resume_after: Option<usize>,
     /// What earlier runs have taught.
     pub learned: Learned,
-    /// Attributes of the resources of a kind, one after the other.
+    /// Attributes of the units of a kind, in order.
     pub attributes: BTreeMap<String, Vec<BTreeMap<String, Value>>>,
-    /// After every so many events the executive's state is written down, and the run goes on with an executive that is made of it.
+    /// After every so many events the executive is replaced by one that is restored from a checkpoint of it.
     pub checkpoint_every: Option<NonZeroUsize>,
 }
 
-/// How much is checked after every event of a run.
+/// The checks after every event of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub enum Checks {
-    /// Nothing: the run is a prediction, and shall cost what it does.
+    /// None: for predictions, which should be cheap.
     Nothing,
-    /// That the resource pool keeps its promises, and the executive's mirror is the root. Costs all that is in the pool each time.
+    /// That the resource pool keeps its invariants, and that the executive's mirror equals the root. Each check costs the whole
+    /// pool.
     #[default]
     Environment,
-    /// The executive's invariants, too. Costs the whole window each time.
+    /// The executive's invariants, too. Each check costs the whole window.
     Everything,
 }
 
@@ -71,12 +71,12 @@ impl Default for Circumstances {
     }
 }
 
-/// When something comes from outside.
+/// The trigger of an event from outside.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Trigger {
     /// Before the run begins.
     Before,
-    /// So many seconds after the start.
+    /// This number of seconds after the start.
     At(f64),
     /// When a goal of this path starts.
     Starts(String),
@@ -84,30 +84,30 @@ pub enum Trigger {
     Ends(String),
 }
 
-/// How messages go wrong: of a hundred, so many.
+/// Faults of messages, in percent.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Mischief {
-    /// What the choices are derived from.
+    /// The random seed.
     pub seed: u64,
-    /// Come twice.
+    /// Messages that arrive twice.
     pub twice_percent: u64,
-    /// Come up to two seconds late.
+    /// Messages that arrive up to two seconds late.
     pub late_percent: u64,
-    /// Answers come although their goal was cancelled.
+    /// Answers that arrive although their goal was cancelled.
     pub crossing_percent: u64,
 }
 
-/// How one message goes.
+/// The delivery of one message.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Delivery {
-    /// So many seconds late.
+    /// Its delay in seconds.
     pub(super) late_s: f64,
-    /// Once more, so many seconds after that.
+    /// The further delay in seconds of a second copy.
     pub(super) again_s: Option<f64>,
 }
 
 impl Mischief {
-    /// How the message of this kind about an attempt goes.
+    /// The delivery of the message of this kind about an attempt.
     pub(super) fn delivery(&self, kind: &str, path: &str, attempt: u32) -> Delivery {
         if self.twice_percent == 0 && self.late_percent == 0 {
             return Delivery::default();
@@ -118,7 +118,7 @@ impl Mischief {
         Delivery { late_s, again_s }
     }
 
-    /// Whether the answer of a cancelled attempt comes all the same.
+    /// Whether a cancelled attempt is still answered.
     pub(super) fn crosses(&self, path: &str, attempt: u32) -> bool {
         self.crossing_percent > 0 && self.dice("cancel", path, attempt).percent(self.crossing_percent)
     }

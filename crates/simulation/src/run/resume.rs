@@ -1,12 +1,13 @@
-//! A run that is resumed: a new executive is told all that happened, says what the old one said, and goes on in its place.
+//! Resumes a run: a new executive handles all events of the log, must give the logged commands, and replaces the old
+//! executive.
 
 use ratn_executive::executive::Executive;
 use ratn_executive::protocol::{Command, LogEntry, LogLine};
 
-/// The executive that stands where the log ends.
+/// The executive in the state at the end of the log.
 ///
 /// # Errors
-/// Where it would have said something else than the log.
+/// The executive gave another command than the log has.
 pub(super) fn resumed(mut fresh: Executive, log: &[LogLine]) -> Result<Executive, String> {
     let mut said: Vec<Command> = Vec::new();
     for line in log {

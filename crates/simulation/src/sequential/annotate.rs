@@ -1,4 +1,4 @@
-//! States that say too little, and what they would say if nothing of it were so.
+//! Missing annotations of states, and their values if nothing unnamed is read or changed.
 
 use ratn_model::catalogue::Catalogue;
 use ratn_model::expression::FactExpr;
@@ -7,7 +7,7 @@ use ratn_model::program::{Annotations, Nature, Program, SUCCESS, State, StateKin
 use ratn_model::resource::ResourceOperation;
 use ratn_model::slot::Slot;
 
-/// What an action does not say, in the words of the task file; empty of every other state.
+/// The missing annotations of an action, in the words of task files; empty for other states.
 pub(super) fn missing(program: &Program, catalogue: &Catalogue, id: StateId) -> Vec<&'static str> {
     let state = program.state(id);
     let annotations = &state.annotations;
@@ -27,7 +27,7 @@ pub(super) fn missing(program: &Program, catalogue: &Catalogue, id: StateId) -> 
     missing
 }
 
-/// Whether nothing that an irreversible action says keeps it from being one that only computes.
+/// Whether no annotation of an irreversible action prevents it from being a computing one.
 fn could_compute(program: &Program, catalogue: &Catalogue, state: &State) -> bool {
     let Annotations { nature, effects, .. } = &state.annotations;
     let around = std::iter::successors(Some(state), |state| state.parent.map(|parent| program.state(parent)));

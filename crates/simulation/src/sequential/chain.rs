@@ -1,4 +1,4 @@
-//! The longest chain of a run: from what ended last, back over what each state waited for.
+//! The critical chain of a run: from the last end back over what each state waited for.
 
 use ratn_executive::protocol::{Command, LogEntry, LogLine, Note};
 use ratn_model::expression::Expr;
@@ -19,7 +19,7 @@ pub struct Link {
     pub began_s: f64,
     /// When it ended, in seconds.
     pub ended_s: f64,
-    /// Why it did not begin before the one before it in the chain had ended.
+    /// Why it could not begin before the previous state of the chain had ended.
     pub because: String,
 }
 
@@ -31,7 +31,7 @@ struct Visit {
     ended: Option<Timestamp>,
 }
 
-/// The chain, from the first to the last.
+/// The chain, first state first.
 pub(super) fn chain(program: &Program, log: &[LogLine]) -> Vec<Link> {
     let visits = Visits::of(log);
     let mut links = Vec::new();
@@ -39,7 +39,7 @@ pub(super) fn chain(program: &Program, log: &[LogLine]) -> Vec<Link> {
     let mut at = last.max_by_key(|(id, visit)| (visit.ended, **id)).map(|(id, visit)| (*id, visit));
     while let Some((id, visit)) = at {
         let (Some(began), Some(ended)) = (visit.began, visit.ended) else { break };
-        // What ended just then, the closest bond first. Of equals, the youngest.
+        // Of those that ended then: the closest bond, then the youngest.
         let before = visits
             .ended_at(began)
             .filter(|(other, earlier)| *other != id && earlier.began.is_some_and(|b| b < began))
@@ -57,13 +57,13 @@ pub(super) fn chain(program: &Program, log: &[LogLine]) -> Vec<Link> {
     links
 }
 
-/// What was executed, and when.
+/// The visits of states, with their times.
 struct Visits {
     all: BTreeMap<InstanceId, Visit>,
     by_end: BTreeMap<Timestamp, Vec<InstanceId>>,
-    /// Those that began, by every path with visits that they are at or within, the oldest first.
+    /// Visits that began, by every path (with visits) that they are at or inside of, the oldest first.
     within: BTreeMap<String, Vec<InstanceId>>,
-    /// The same by the path around and the name of the state, whichever visit of it.
+    /// The same by the path around and the name of the state, for all visits of it.
     of_state: BTreeMap<(String, String), Vec<InstanceId>>,
 }
 
@@ -88,10 +88,10 @@ impl Visits {
         self.by_end.get(&at).into_iter().flatten().map(|id| (*id, &self.all[id]))
     }
 
-    /// The visit that writes what a visit takes of `source`: the latest before it, in the same iterations of the loops around both, and of
-    /// what is within `source` the one that ended last.
+    /// The visit that writes what a visit takes from `source`: the latest before it, in the same iterations of the loops around both; if
+    /// `source` contains states, the inner visit that ended last.
     fn source(&self, program: &Program, source: StateId, behind: InstanceId) -> Option<InstanceId> {
-        // The states around the source, which are those around the visit too, with their iterations and visits.
+        // The states around the source are also around the visit, in the same iterations and visits.
         let source = program.state(source);
         let depth = source.path.split('/').count() - 1;
         let place = |path: &str, depth: usize| path.split('/').take(depth).collect::<Vec<_>>().join("/");
@@ -99,7 +99,7 @@ impl Visits {
         let around = place(&self.all[&behind].path, depth);
         let visits = self.of_state.get(&(around, source.name.clone()))?;
         let latest = visits[..older(visits)].last()?;
-        // All that is within one visit of the source has its place in common.
+        // All visits inside of one visit of the source have the same place.
         let own = self.within.get(&place(&self.all[latest].path, depth + 1))?;
         own[..older(own)].iter().copied().max_by_key(|id| (self.all[id].ended, *id))
     }
@@ -130,7 +130,7 @@ fn visits(log: &[LogLine]) -> BTreeMap<InstanceId, Visit> {
     visits
 }
 
-/// Why one state waits for another, the closest first.
+/// Why one state waits for another, the closest bond first.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 enum Bond {
     Output,
@@ -139,7 +139,7 @@ enum Bond {
     Looking,
     Order,
     World,
-    /// They only ended and began together, as far as the program says.
+    /// They only ended and began at the same time; the program gives no reason.
     Coincidence,
 }
 
@@ -157,7 +157,7 @@ impl Bond {
     }
 }
 
-/// Why the visit `behind` waits for the visit `before`. Where a state is visited several times, each visit takes the outputs of one visit.
+/// The bond of the visit `behind` to the visit `before`. If a state is visited several times, each visit takes the outputs of one visit.
 fn bond(program: &Program, visits: &Visits, before: InstanceId, behind: InstanceId) -> Bond {
     let (earlier, visit) = (&visits.all[&before], &visits.all[&behind]);
     let state = program.state(visit.state);
@@ -180,7 +180,7 @@ fn bond(program: &Program, visits: &Visits, before: InstanceId, behind: Instance
     if let Some(kind) = blocked(program, state).find(|kind| blocked_before().any(|k| k == *kind)) {
         return Bond::Resource(kind.to_owned());
     }
-    // What is younger is waited for over its resources only.
+    // A state waits for a younger one only because of resources.
     if before > behind {
         return Bond::Coincidence;
     }
@@ -191,7 +191,7 @@ fn bond(program: &Program, visits: &Visits, before: InstanceId, behind: Instance
     }
 }
 
-/// Whether a state is another one or within it.
+/// Whether a state is another one or inside of it.
 fn is_within(program: &Program, state: StateId, outer: StateId) -> bool {
     std::iter::successors(Some(state), |id| program.state(*id).parent).any(|ancestor| ancestor == outer)
 }

@@ -1,8 +1,7 @@
-//! What keeps a task sequential: it is simulated as written and as a dataflow network with the durations that are known, and again
-//! with states annotated that say too little.
+//! Finds what keeps a task sequential: simulates it in HSM mode and in CDTN mode with the known durations, and again with missing annotations added.
 //!
-//! What the actions will answer is not known here: they succeed, with assumed outputs of the declared types. So a figure
-//! is what an annotation is worth if it is true, not a promise.
+//! The actions' results are unknown: they succeed, with assumed outputs of the declared types. So a figure is the gain of an annotation if the
+//! annotation is true, not a promise.
 
 mod annotate;
 mod chain;
@@ -28,92 +27,92 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Of more states that say too little, those that take longest are looked at …
+/// Limit of examined states; those with the longest durations are taken …
 const MAX_CANDIDATES: usize = 40;
-/// … and so few that all simulations together have about so many goals.
+/// … and no more than give about this number of goals in all simulations together.
 const MAX_GOALS: usize = 20_000;
-/// Of each state: it alone, and all but it.
+/// Per state: it alone, and all but it.
 const SIMULATIONS: usize = 2;
-/// A gain below this, in seconds, is none.
+/// A smaller gain, in seconds, counts as none.
 const NO_GAIN_S: f64 = 1e-6;
 
-/// What is assumed where nothing is known.
+/// Assumptions for what is unknown.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Assumptions {
     /// The task's parameters, all bound.
     pub parameters: BTreeMap<String, Value>,
-    /// How many elements a list has that an action answers.
+    /// Number of elements in a list that an action returns.
     pub elements: usize,
-    /// Durations that earlier runs have taught, by plain path, in seconds.
+    /// Learned durations, by path without visits, in seconds.
     pub durations_s: BTreeMap<String, f64>,
-    /// How much there is of each resource kind, where it is not as much as the catalogue allows.
+    /// Capacity of resource kinds, if not the catalogue's maximum.
     pub units: BTreeMap<String, Quantity>,
-    /// What the attributes of the resources of a kind are, one after the other: those of arms say which arm they are.
+    /// Attributes of the units of a kind, in order: those of arms tell which arm they are.
     pub attributes: BTreeMap<String, Vec<BTreeMap<String, Value>>>,
 }
 
-/// What keeps a task sequential.
+/// The result.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Sequential {
-    /// As written, in seconds.
+    /// Makespan in HSM mode, in seconds.
     pub hsm_s: f64,
-    /// As a dataflow network, in seconds.
+    /// Makespan in CDTN mode, in seconds.
     pub cdtn_s: f64,
-    /// Of the latter, what waited for what, from the first to the last.
+    /// The critical chain in CDTN mode, first state first.
     pub chain: Vec<Link>,
-    /// The states that say too little, those whose annotation gains most first.
+    /// The states with missing annotations, the largest gain first.
     pub gains: Vec<Gain>,
-    /// As a dataflow network if all of these were annotated, in seconds; `None` where that cannot be simulated.
+    /// Makespan in CDTN mode if all of these were annotated, in seconds; `None` if that cannot be simulated.
     pub annotated_s: Option<f64>,
-    /// The states whose failure is handled, and what `exceptional: [aborted]` would gain: what follows a failure would not be computed
-    /// ahead. The same of the timeout of a wait, and of the answers to a question that are not assumed. Only those that gain something.
+    /// The states whose failure is handled, with the gain of `exceptional: [aborted]`, with which the failure's handler is not computed ahead.
+    /// Likewise for the timeout of a wait, and for answers to a question that are not assumed. Only states with a gain.
     pub exceptional: Vec<Gain>,
-    /// The actions whose duration nobody knows: a second is assumed.
+    /// The actions with unknown duration: one second is assumed.
     pub unknown_durations: Vec<String>,
 }
 
-/// What annotating a state would gain.
+/// The gain of annotating a state.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Gain {
-    /// The state.
+    /// The path of the state.
     pub path: String,
-    /// What it does not say: `reads`, `effects`, `computes`.
+    /// The missing annotations: `reads`, `effects`, `computes`.
     pub missing: Vec<Cow<'static, str>>,
-    /// Seconds by which the task is shorter, if only this state is annotated.
+    /// Seconds saved if only this state is annotated.
     pub alone_s: f64,
-    /// The same, in percent.
+    /// The same in percent.
     pub alone_percent: f64,
-    /// Seconds by which the task is shorter than if all the others are annotated and this one is not.
+    /// Seconds saved by annotating this state when all others are annotated.
     pub last_s: f64,
 }
 
-/// Why nothing can be said.
+/// Error: the simulation did not succeed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Obstacle {
-    /// A core gave up.
+    /// The simulation failed.
     #[error("the simulation in {mode} mode comes to no end: {source}")]
     Run {
         /// In which mode.
         mode: &'static str,
-        /// Why.
+        /// The cause.
         source: RunError,
     },
-    /// It ended otherwise than tasks should.
+    /// The task did not succeed.
     #[error("with assumed outputs the task ends in {mode} mode with `{outcome}`: {reason}")]
     Outcome {
         /// In which mode.
         mode: &'static str,
-        /// How.
+        /// The outcome.
         outcome: String,
-        /// Why.
+        /// Its reason.
         reason: String,
     },
 }
 
-/// Simulates a checked program.
+/// Analyses a checked program.
 ///
 /// # Errors
-/// [`Obstacle`] where the task does not come to a successful end with what is assumed.
+/// [`Obstacle`] if the task does not succeed with the assumptions.
 pub fn sequential(program: &Program, catalogue: &Catalogue, assumptions: &Assumptions) -> Result<Sequential, Obstacle> {
     let mut unknown = BTreeSet::new();
     let hsm = simulate(program, catalogue, assumptions, Mode::Hsm, &mut unknown)?;
@@ -154,11 +153,11 @@ pub fn sequential(program: &Program, catalogue: &Catalogue, assumptions: &Assump
     })
 }
 
-/// How long a checked program takes as a dataflow network, in seconds, with what is assumed. It is given up after so many events, which bounds how
-/// much memory that takes, and when `goes_on`, which is asked before every event, no longer holds.
+/// The makespan of a checked program in CDTN mode, in seconds, with the assumptions. The simulation stops after `max_events` events, which bounds its
+/// memory, and when `goes_on`, which is called before every event, returns false.
 ///
 /// # Errors
-/// [`Obstacle`] where the task does not come to a successful end with what is assumed.
+/// [`Obstacle`] if the task does not succeed with the assumptions.
 pub fn makespan_s(
     program: &Program,
     catalogue: &Catalogue,
@@ -170,7 +169,7 @@ pub fn makespan_s(
     simulate_within(bound, program, catalogue, assumptions, Mode::Cdtn, &mut BTreeSet::new()).map(|run| run.end_s)
 }
 
-/// The states of which outcomes that are handled could be exceptional, with what that gains.
+/// The states with handled outcomes that could be exceptional, and the gain.
 fn exceptional(program: &Program, run: &Run, mut ends_s: impl FnMut(&Program) -> Option<f64>) -> Vec<Gain> {
     let came = outcomes(run);
     let is_meant = |id: StateId| !seldom(program, &came, id).is_empty();
@@ -204,8 +203,8 @@ fn exceptional(program: &Program, run: &Run, mut ends_s: impl FnMut(&Program) ->
     gains
 }
 
-/// The outcomes of a state whose handlers are computed ahead, and that may be seldom: a failure; of a state that waits the time that is over, and the
-/// answers that are not assumed.
+/// The outcomes of a state whose handlers are computed ahead although they may be rare: a failure; for a wait also its timeout, and answers that are
+/// not assumed.
 fn seldom(program: &Program, came: &BTreeSet<(StateId, &str)>, id: StateId) -> Vec<String> {
     let waits = matches!(program.state(id).wait(), Some(Wait::Condition(_) | Wait::Signal(_) | Wait::Answer(_)));
     let may_be = |outcome: &&str| *outcome == ABORTED || (waits && ![SUCCESS, PREEMPTED].contains(outcome));
@@ -214,7 +213,6 @@ fn seldom(program: &Program, came: &BTreeSet<(StateId, &str)>, id: StateId) -> V
     handled.map(str::to_owned).collect()
 }
 
-/// By which outcomes states have ended.
 fn outcomes(run: &Run) -> BTreeSet<(StateId, &str)> {
     let (mut states, mut came) = (BTreeMap::new(), BTreeSet::new());
     for line in &run.log {
@@ -231,12 +229,12 @@ fn outcomes(run: &Run) -> BTreeSet<(StateId, &str)> {
     came
 }
 
-/// A gain to the microsecond.
+/// A gain, rounded to microseconds.
 fn rounded(seconds: f64) -> f64 {
     if seconds.abs() < NO_GAIN_S { 0.0 } else { (seconds * 1e6).round() / 1e6 }
 }
 
-/// The states that are executed and of such a kind; of many, those that take longest.
+/// The executed states that satisfy `is_meant`; if there are many, those with the longest durations.
 fn executed(run: &Run, is_meant: impl Fn(StateId) -> bool) -> Vec<StateId> {
     let mut busy_s: BTreeMap<StateId, f64> = BTreeMap::new();
     let mut states = BTreeMap::new();
@@ -276,7 +274,7 @@ fn simulate(
     simulate_within(bound, program, catalogue, assumptions, mode, unknown)
 }
 
-/// When a simulation is given up.
+/// The limits of a simulation.
 struct Bound<'b> {
     max_events: usize,
     goes_on: &'b dyn Fn() -> bool,
@@ -300,7 +298,7 @@ fn simulate_within(
     };
     let offered = catalogue.resources.iter().filter(|(_, offer)| offer.class != ResourceClass::Task);
     let mut program = program.clone();
-    // How long it may take is not asked here.
+    // The task's deadline is ignored here.
     program.deadline_s = None;
     let program = Arc::new(program);
     let setup = Setup {

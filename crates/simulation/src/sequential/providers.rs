@@ -1,5 +1,5 @@
-//! Providers of which nothing is known but their ports: every goal succeeds, after as long as is known, with assumed outputs. What states
-//! wait for comes, too: conditions are made to hold, and questions have their default or their first choice as answer.
+//! Assumed providers, of which only the ports are known: every goal succeeds, after its known duration, with assumed outputs. Waits end,
+//! too: conditions are made true, and questions get their default or their first choice as answer.
 
 use super::Assumptions;
 use crate::run::{Answer, Oracle, Performance};
@@ -16,16 +16,15 @@ use ratn_model::wait::Wait;
 use ratn_world::world::World;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Seconds that an action takes of which no duration is known.
+/// Assumed duration of an action, in seconds, if none is known.
 const UNKNOWN_S: f64 = 1.0;
-/// After so many goals every further one fails: with what is assumed, the task goes on for ever.
+/// Limit of goals; further ones fail, because with these assumptions the task would never end.
 const MAX_GOALS: usize = 5_000;
-/// A list of numbers is a size or a position.
+/// Length of an assumed list of numbers: a size or a position.
 const NUMBERS: usize = 3;
-/// Joints of an arm.
+/// Number of joints of an assumed arm.
 const JOINTS: usize = 7;
 
-/// Answers what is assumed.
 pub(super) struct AssumedProviders {
     /// By the path of the state.
     outputs: BTreeMap<String, BTreeMap<String, Type>>,
@@ -60,7 +59,6 @@ impl AssumedProviders {
         }
     }
 
-    /// The states of which no duration was known.
     pub(super) fn unknown_durations(&mut self) -> BTreeSet<String> {
         std::mem::take(&mut self.unknown)
     }
@@ -123,7 +121,7 @@ impl Oracle for AssumedProviders {
     }
 }
 
-/// The facts that make the condition of a wait hold, where it says them outright and their arguments are constants.
+/// The facts that make the condition of a wait true, if it states them literally with constant arguments.
 fn made_true(state: &State) -> Option<Vec<(FactKey, Option<Value>)>> {
     let foreseen = state.annotations.effects.get(SUCCESS)?;
     let changes = EffectExpr::bind(foreseen, &NothingKnown).ok().filter(|changes| !changes.is_empty())?;
@@ -144,7 +142,7 @@ fn plain(path: &str) -> String {
     parts.collect::<Vec<_>>().join("/")
 }
 
-/// A value of a type; strings and list elements by the port's name, all different.
+/// An assumed value of a type; strings and list elements use the port's name and are all different.
 fn assumed(ty: &Type, name: &str, elements: usize) -> Value {
     match ty {
         Type::Bool => Value::Bool(true),

@@ -1,12 +1,12 @@
-//! A task control that dies without a word among the others, and is taken up again from its event log.
+//! A task control that dies without notice while others run, and is resumed from its event log.
 //!
 //! ```text
-//! dies ─► its goals go on for 3 s, then they stop ─► its session ends after 3 s, and with it its leases ─► it is taken up again
-//!   └─ of the commands of its last event some are written down, and some of these performed
+//! dies ─► its goals go on for 3 s, then they stop ─► its session ends after 3 s, and with it its leases ─► it is resumed
+//!   └─ of the commands of its last event some are logged, and some of these performed
 //! ```
 //!
-//! It comes back as `ratn run --resume` does (`ratn-task-control`): its log is replayed, what it had decided to commit is committed or
-//! refused, what it had asked for is asked for again, of each goal it hears what became of it, and then what others have changed.
+//! It comes back as `ratn run --resume` does (`ratn-task-control`): its log is replayed; its decided commits are made or refused; its
+//! requests are made again; it learns how each goal ended; then it gets the changes by others.
 
 use super::{Due, System, What};
 use crate::run::RunError;
@@ -22,48 +22,48 @@ use std::cmp::Reverse;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// A session lives so long without its client, and a goal goes on so long without a listener.
+/// Lifetime of a session without its client, and of a goal without a listener, in seconds.
 pub const SESSION_S: f64 = 3.0;
 
-/// The outcome of a run that is refused when it comes back.
+/// The outcome of a run that is refused when it is resumed.
 pub const REFUSED: &str = "refused";
 
-/// When a task control dies, and when it is taken up again.
+/// When a task control dies and is resumed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Death {
-    /// With the first event from this virtual second on.
+    /// It dies at the first event from this virtual second on.
     pub at_s: f64,
-    /// So many of the commands of that event are written down, as far as there are …
+    /// Number of commands of that event that are logged, if there are so many …
     pub written: usize,
-    /// … and so many performed, if all are written; else none.
+    /// … and number of commands performed, if all are logged; else none.
     pub performed: usize,
-    /// So many virtual seconds later it is taken up again.
+    /// It is resumed after this number of virtual seconds.
     pub away_s: f64,
 }
 
-/// A run without its task control.
+/// The state of a run without task control.
 pub(super) struct Gone {
     since: Timestamp,
-    /// Written down and not performed.
+    /// Commands that were logged but not performed.
     unperformed: Vec<Command>,
-    /// What it has not heard of.
+    /// Events that it has missed.
     kept: Vec<Event>,
     has_lost: bool,
-    /// So many commits there were of all runs.
+    /// Number of commits by all runs at its death.
     commits: usize,
 }
 
 impl Gone {
-    /// What would have been told to task control.
+    /// Keeps an event for the resumed task control.
     pub(super) fn keep(&mut self, now: Timestamp, event: Event) {
         match event {
-            // A grant that nobody has heard of goes back; who has to give way is nobody.
+            // Resuming gives back unknown grants, and compares the worlds.
             Event::Granted { .. } | Event::WantedByOthers { .. } | Event::WorldChanged { .. } => {}
             event => self.kept.push(self.as_it_ended(now, event)),
         }
     }
 
-    /// A goal that would have gone on longer than anybody let it was stopped.
+    /// A goal that would have run longer than without a listener allowed was stopped.
     fn as_it_ended(&self, at: Timestamp, event: Event) -> Event {
         match event {
             Event::Finished { instance, attempt, .. } | Event::Crashed { instance, attempt, .. }
@@ -81,7 +81,7 @@ impl Gone {
     }
 }
 
-/// How many of so many commands a task control writes down and performs before it dies.
+/// The numbers of commands that a task control logs and performs before it dies.
 pub(super) fn reached(death: Option<&Death>, commands: usize) -> (usize, usize) {
     let Some(death) = death else { return (commands, commands) };
     let written = death.written.min(commands);
@@ -101,7 +101,7 @@ impl System<'_> {
         Ok(())
     }
 
-    /// Its session has not been kept alive: what it holds and has asked for is gone.
+    /// Its session expires: its leases and requests are gone.
     pub(super) fn session_ends(&mut self, run: usize) {
         let one = &mut self.runs[run];
         let Some(gone) = &mut one.gone else { return };
@@ -148,8 +148,8 @@ impl System<'_> {
         Ok(())
     }
 
-    /// The first fact that another run has changed meanwhile, and that a commit that is not made yet changes or is made of: as task control
-    /// (`performer/resume.rs`) refuses it.
+    /// The first fact changed by another run meanwhile that a pending commit changes or depends on; task control (`performer/resume.rs`)
+    /// refuses the run for the same reason.
     fn overtaken(&self, run: usize, commits: &[Command], since: usize) -> Option<FactKey> {
         let by_others = self.commits[since..].iter().filter(|(by, _)| *by != run).flat_map(|(_, keys)| keys);
         let is_meant = |key: &&FactKey| {
@@ -161,7 +161,7 @@ impl System<'_> {
         by_others.clone().find(is_meant).cloned()
     }
 
-    /// What became of its goals while nobody listened, and what else came.
+    /// Sends the missed events, and how its goals ended meanwhile.
     fn hears_again(&mut self, run: usize, gone: Gone) -> Result<(), RunError> {
         let mut kept = Vec::new();
         let is_over = self.now.since(gone.since) >= Duration::from_secs_f64(SESSION_S);
@@ -181,7 +181,7 @@ impl System<'_> {
         Ok(())
     }
 
-    /// What it does not know to hold goes back, and what it waits for it asks for anew.
+    /// Gives back leases that it does not know, and makes its pending requests again.
     fn asks_again(&mut self, run: usize) -> Result<(), RunError> {
         let one = &mut self.runs[run];
         let waiters = std::mem::take(&mut one.waiters);
@@ -201,7 +201,7 @@ impl System<'_> {
         Ok(())
     }
 
-    /// What is otherwise in the root than the run believes.
+    /// The differences of the root from the run's mirror.
     fn differences(&self, run: usize) -> Vec<(FactKey, Option<Value>)> {
         let mirror = self.runs[run].executive.root();
         let written = self.root.iter().filter(|(key, fact)| mirror.get(key) != Some(&fact.value));
@@ -211,7 +211,7 @@ impl System<'_> {
     }
 }
 
-/// The executive that stands where the log ends, and what the log lacks of what it said last.
+/// The executive in the state at the end of the log, and its last commands that are missing in the log.
 fn replayed(program: &Arc<Program>, log: &[LogLine]) -> Result<(Executive, Vec<Command>), String> {
     let mut executive = Executive::new(program.clone(), Tolerance::ROBOT);
     let mut said: std::collections::VecDeque<Command> = Default::default();

@@ -56,7 +56,7 @@ impl Maker {
         Expr::Binary(BinaryOperator::Equal, Box::new(what), Box::new(limit))
     }
 
-    /// Facts with keys from ports, facts and queries as inputs, the tolerated predicate.
+    /// Adds inputs with facts and queries, facts with keys from ports, and the tolerated predicate.
     fn looked_at(
         &mut self,
         annotations: &mut Annotations,
@@ -77,7 +77,7 @@ impl Maker {
             };
             if let Some(argument) = facts.first_mut().and_then(|fact| fact.arguments.first_mut()) {
                 *argument = Some(key.clone());
-                // The oracle learns from the inputs what it may see.
+                // The oracle knows from the inputs which facts it may see.
                 inputs.push(("key".to_owned(), key));
             }
         }

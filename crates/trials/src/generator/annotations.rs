@@ -1,17 +1,17 @@
-//! What the states of random programs are annotated with: true, but often only in part.
+//! Annotations of random states: true, but often incomplete.
 
 use super::*;
 use ratn_model::program::{Nature, ResourceExpr, Retry, STOPPED, WORLD_MODEL};
 use ratn_model::resource::ResourceClass;
 
 impl Maker {
-    /// Of an action.
+    /// The annotations of an action.
     pub(super) fn annotations(&mut self, room: &Room, visible: &Visible, custom: bool) -> Annotations {
         let mut annotations = Annotations::default();
         let facts = |maker: &mut Maker, most: u64| -> Vec<FactExpr> {
             (0..maker.dice.below(most + 1)).map(|_| maker.fact(&room.readable, visible)).collect()
         };
-        // In a preemptive concurrency nobody waits for a worker: each region has one of everything.
+        // In a preemptive concurrency no region waits for a worker: each has one of every kind.
         let nature = match self.dice.below(10) {
             5 | 6 if room.is_preemptive => 0,
             7.. if room.actuators.is_empty() => 0,
@@ -87,7 +87,7 @@ impl Maker {
             annotations.effects.insert(STOPPED.to_owned(), Vec::new());
         }
         if !room.is_alone && annotations.nature == Nature::Irreversible {
-            // `preempted`, too, writes nothing of another region.
+            // The outcome `preempted`, too, must not write facts of another region.
             annotations.effects.insert("preempted".to_owned(), Vec::new());
         }
         if !room.is_preemptive && self.dice.percent(10) {
@@ -110,7 +110,7 @@ impl Maker {
         annotations
     }
 
-    /// A precondition that holds more often than not.
+    /// A precondition that is true more often than not.
     pub(super) fn required(&mut self, room: &Room, visible: &Visible) -> Expr {
         if self.features.blind {
             return Expr::Literal(Value::Bool(true));
@@ -122,7 +122,7 @@ impl Maker {
         let number = |n: i64| Box::new(Expr::Literal(Value::Int(n)));
         let not = |e: Expr| Expr::Unary(UnaryOperator::Not, Box::new(e));
         match self.dice.below(4) {
-            // Numeric; a fact that is absent is no number.
+            // A numeric condition; an absent fact is no number.
             0 if self.features.effects => {
                 let less = Expr::Binary(BinaryOperator::Less, Box::new(Expr::Fact(fact.clone())), number(3));
                 Expr::Binary(BinaryOperator::Or, Box::new(not(Expr::Exists(fact))), Box::new(less))
@@ -133,7 +133,7 @@ impl Maker {
     }
 }
 
-/// One unit for itself.
+/// A block of one unit.
 pub(super) fn block(kind: &str) -> ResourceExpr {
     resource(ResourceOperation::Block, kind, 1)
 }

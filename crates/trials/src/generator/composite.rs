@@ -42,7 +42,7 @@ impl Maker {
         StateKind::Sequence { children, outputs }
     }
 
-    /// What a hierarchy or a concurrency does at its entry and exit.
+    /// The annotations of a hierarchy or a concurrency at its entry and exit.
     pub(super) fn boundary(&mut self, room: &Room, visible: &Visible) -> Annotations {
         let mut annotations = Annotations::default();
         for (outcome, chance) in [(SUCCESS, 20), (ABORTED, 20), (FOUND, 10)] {
@@ -115,7 +115,7 @@ impl Maker {
         StateKind::ForEach { variable, index, collection, body, outputs: Vec::new() }
     }
 
-    /// `while` or `do … while`, counted.
+    /// A `while` or `do … while` that counts its iterations.
     pub(super) fn repeat(&mut self, id: StateId, path: &str, depth: u64, room: &Room, visible: &Visible) -> StateKind {
         let index = format!("i{}", id.0);
         let limit = Expr::Literal(Value::Int(1 + self.dice.below(3) as i64));
@@ -124,7 +124,7 @@ impl Maker {
         let mut inner = visible.clone();
         inner.variables.push(index.clone());
         let (body, seen, outcomes) = self.list(id, path, depth + 1, room, inner, true);
-        // The body's outputs, or what is seen outside.
+        // An output of the body, or one that is visible outside.
         let own = seen.ports.iter().rev().find(|state| !visible.ports.contains(state)).copied();
         let body_first = self.dice.percent(40);
         let predicate = match own {

@@ -1,4 +1,4 @@
-//! What nodes change: keys, lists and amounts that come from ports and facts.
+//! Effects of nodes: keys, lists and amounts that come from ports and facts.
 
 use super::*;
 
@@ -7,10 +7,10 @@ fn one() -> Expr {
 }
 
 impl Maker {
-    /// What a node changes.
+    /// An effect of a node.
     pub(super) fn effect(&mut self, room: &Room, visible: &Visible, own_outputs: bool) -> EffectExpr {
         if room.writable.is_empty() {
-            // Nothing to write: the effect that changes nothing.
+            // It may write nothing: an effect without consequence.
             return EffectExpr::Delete(fact_at(PREDICATES + 1, 0));
         }
         if let Some(effect) = self.special_effect(room, visible, own_outputs) {
@@ -54,7 +54,7 @@ impl Maker {
         EffectExpr::Set(fact, value)
     }
 
-    /// Quantified effects within each other, effects made of the fact itself.
+    /// Nested quantified effects, and effects that depend on the fact itself.
     fn special_effect(&mut self, room: &Room, visible: &Visible, own_outputs: bool) -> Option<EffectExpr> {
         if self.features.keys && !room.is_preemptive && own_outputs && self.dice.percent(15) {
             return Some(self.nested(room, visible));
@@ -74,7 +74,7 @@ impl Maker {
         None
     }
 
-    /// An effect for each of a list, for each of another.
+    /// An effect for each element of a list, for each element of another one.
     fn nested(&mut self, room: &Room, visible: &Visible) -> EffectExpr {
         let (outer, inner) = ("each".to_owned(), "other".to_owned());
         let mut fact = self.fact(&room.writable, visible);
@@ -100,7 +100,7 @@ impl Maker {
         EffectExpr::ForEach { variable: outer, collection: of, effects }
     }
 
-    /// A list, of a port as a rule, which may be empty.
+    /// A list, usually from a port, which may be empty.
     pub(super) fn list_of_numbers(&mut self, visible: &Visible, own_outputs: bool) -> Expr {
         let actions: Vec<StateId> = visible.ports.iter().copied().filter(|id| self.is_action(*id)).collect();
         match self.dice.below(6) {
@@ -114,7 +114,7 @@ impl Maker {
         }
     }
 
-    /// One of the fact's arguments is what a port says.
+    /// Replaces one of the fact's arguments by the value of a port.
     fn key_from_port(&mut self, fact: &mut FactExpr, room: &Room, visible: &Visible, own_outputs: bool) {
         if !self.features.keys || room.is_preemptive || !own_outputs || !self.dice.percent(25) {
             return;
@@ -128,7 +128,7 @@ impl Maker {
         }
     }
 
-    /// By how much a number grows: anything.
+    /// The increment of a number: any number.
     pub(super) fn amount(&mut self, visible: &Visible, own_outputs: bool) -> Expr {
         const SOME: [f64; 7] = [1.0, 0.5, -1.0, 0.1, -0.3, 2.5, 0.001];
         let number = Expr::Literal(Value::Float(SOME[self.dice.below(7) as usize]));

@@ -1,9 +1,9 @@
-//! How long states say they take, and how often they are tried.
+//! Declared durations of states, and their numbers of attempts.
 
 use super::*;
 
 impl Maker {
-    /// Of an action.
+    /// Adds estimates to an action.
     pub(super) fn estimates(&mut self, annotations: &mut Annotations, visible: &Visible) {
         if !self.features.estimates {
             return;

@@ -1,21 +1,21 @@
-//! Which facts there are and how they are looked up: keys, wildcards, fields, queries.
+//! Facts and ways to look them up: keys, wildcards, fields, queries.
 
 use super::*;
 
-/// Those that only [`Features::facts`] has, with how many arguments they have.
+/// Predicates that exist only with [`Features::facts`], with their arity.
 const WIDER: [(u64, usize); 5] = [(COUNTER, 0), (21, 2), (22, 2), (23, 3), (RECORD, 1)];
 /// The counter `p20()`.
 pub(super) const COUNTER: u64 = 20;
-/// What this predicate says is a record of two numbers, `a` and `b`, as a rule.
+/// A predicate whose value is usually a record of two numbers, `a` and `b`.
 pub(super) const RECORD: u64 = 24;
 
-/// The predicates that programs of these features read and write.
+/// The predicates that programs with these features read and write.
 pub(super) fn predicates(features: &Features) -> Vec<u64> {
     let wider = WIDER.iter().map(|(predicate, _)| *predicate).filter(|_| features.facts);
     (0..PREDICATES).chain(wider).collect()
 }
 
-/// What holds at the start of the predicates that not all programs have.
+/// The initial facts of the predicates that not all programs have.
 pub(super) fn initial(features: &Features) -> Vec<EffectExpr> {
     let number = |n: i64| Expr::Literal(Value::Int(n));
     let set = |predicate: u64, arguments: &[i64], value: Expr| {
@@ -36,7 +36,6 @@ pub(super) fn initial(features: &Features) -> Vec<EffectExpr> {
     all
 }
 
-/// How many arguments a predicate has.
 pub(super) fn arity(predicate: u64) -> usize {
     WIDER.iter().find(|(wider, _)| *wider == predicate).map_or(1, |(_, arity)| *arity)
 }
@@ -52,7 +51,7 @@ impl Maker {
             _ if self.dice.percent(15) => None,
             _ => Some(Expr::Literal(Value::Int(self.dice.below(ARGUMENTS) as i64))),
         };
-        // Where nothing is left to read, something that nobody writes.
+        // If it may read nothing, a predicate that nobody writes.
         let predicate = self.dice.one_of(among).copied().unwrap_or(PREDICATES);
         let mut fact = FactExpr { predicate: format!("p{predicate}"), arguments: vec![argument] };
         if self.features.facts && arity(predicate) != 1 {
@@ -61,7 +60,7 @@ impl Maker {
         fact
     }
 
-    /// An argument of a fact with several; none is a wildcard.
+    /// An argument of a fact with several arguments; `None` is a wildcard.
     fn argument(&mut self, visible: &Visible) -> Option<Expr> {
         match self.dice.below(10) {
             0 | 1 => None,
@@ -71,7 +70,7 @@ impl Maker {
         }
     }
 
-    /// Something that a fact says, or whether it is there.
+    /// An expression that looks up a fact, or tests whether it exists.
     pub(super) fn lookup(&mut self, room: &Room, visible: &Visible) -> Expr {
         let fact = self.fact(&room.readable, visible);
         if fact.predicate == format!("p{RECORD}") && self.dice.percent(80) {
@@ -89,7 +88,7 @@ impl Maker {
         }
     }
 
-    /// A query about what may be read: whether there are facts that go together.
+    /// A query over readable facts: whether matching facts exist.
     pub(super) fn query(&mut self, room: &Room, visible: &Visible) -> Expr {
         let unknown = |name: &str| Expr::Unknown(name.to_owned());
         let is = |a: Expr, b: Expr| Expr::Binary(BinaryOperator::Equal, Box::new(a), Box::new(b));
@@ -119,7 +118,7 @@ impl Maker {
         if self.dice.percent(30) { not(query) } else { query }
     }
 
-    /// A fact in a query: some of its arguments are the query's variable of this name.
+    /// A fact in a query: some of its arguments are the query variable with this name.
     fn asked(&mut self, room: &Room, visible: &Visible, name: &str) -> FactExpr {
         let mut fact = self.fact(&room.readable, visible);
         let mut is_asked = false;

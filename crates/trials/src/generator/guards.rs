@@ -1,10 +1,10 @@
-//! Retries of any state with something done before each, and what is done on every way out.
+//! `retry` of any state with something to execute before each try, and `finally`.
 
 use super::*;
 use ratn_model::guard::Retried;
 
 impl Maker {
-    /// What stands around a state that is there already.
+    /// Adds a guard to an existing state.
     pub(super) fn guard(&mut self, id: StateId, path: &str, depth: u64, room: &Room, visible: &Visible) {
         let mut guard = Guard::default();
         if self.dice.percent(70) {
@@ -30,7 +30,7 @@ impl Maker {
         self.guards.insert(id, guard);
     }
 
-    /// States that stand around one; it may be left by the outcomes by which they are.
+    /// States of a guard; the guarded state may be left by the outcomes of these states.
     fn beside(&mut self, id: StateId, path: &str, depth: u64, room: &Room, visible: &Visible) -> Vec<StateId> {
         let (list, _, leaving) = self.list(id, path, depth + 2, room, visible.clone(), false);
         for outcome in leaving {

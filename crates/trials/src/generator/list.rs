@@ -1,11 +1,11 @@
-//! Lists of states, and where their outcomes lead.
+//! Lists of states, and the targets of their outcomes.
 
 use super::*;
 use ratn_model::program::STOPPED;
 use ratn_model::wait::TIMEOUT;
 
 impl Maker {
-    /// A list of states; with what is visible behind it, and the custom outcomes by which it is left.
+    /// A list of states; also the names visible behind it, and the custom outcomes by which it is left.
     pub(super) fn list(
         &mut self,
         parent: StateId,
@@ -44,7 +44,8 @@ impl Maker {
         (children, visible, outcomes)
     }
 
-    /// Where the outcomes of a list's states lead; the custom outcomes that leave the list, and whether anything leads back.
+    /// Adds transitions to a list's states; returns the custom outcomes that leave the list, and whether a transition leads
+    /// back.
     pub(super) fn transitions(&mut self, children: &[StateId]) -> (Vec<String>, bool) {
         let (mut leaving, mut back): (Vec<String>, bool) = (Vec::new(), false);
         for (place, id) in children.iter().enumerate() {
@@ -105,7 +106,7 @@ impl Maker {
         }
     }
 
-    /// Where a state may be visited again, an action may use what a later one wrote the time before.
+    /// If a state may be visited again, an action may use what a later state wrote in the previous round.
     pub(super) fn flow_back(&mut self, children: &[StateId]) {
         if !self.features.variables || !self.dice.percent(40) {
             return;
@@ -145,7 +146,7 @@ impl Maker {
         let composite = depth < 3 && self.dice.percent(38);
         let kinds = if room.is_preemptive { 1 } else { 9 };
         if composite && self.features.blind && !room.is_preemptive && self.dice.percent(40) {
-            // Where motions run beside each other, and one fails, is what it is about.
+            // Concurrent motions, one of which fails, are what these programs test.
             let kind = self.barrier(id, &path, depth, room, visible);
             self.at(id).kind = kind;
             return id;

@@ -1,4 +1,4 @@
-//! Chains of a hundred, loops of a thousand: a few programs are that and nothing else.
+//! Chains of a hundred states and loops of a thousand iterations; a few programs consist only of one.
 
 use super::*;
 
@@ -6,7 +6,8 @@ const CHAIN: u64 = 100;
 const LOOP: i64 = 1_000;
 
 impl Maker {
-    /// The states of the task, what is visible behind them, and the outcomes by which they are left; as a rule nothing.
+    /// The states of such a task, the names visible behind them, and the outcomes by which they are left; usually
+    /// `None`.
     pub(super) fn long(&mut self, room: &Room, visible: &Visible) -> Option<(Vec<StateId>, Visible, Vec<String>)> {
         if !self.features.long {
             return None;
@@ -18,7 +19,7 @@ impl Maker {
         }
     }
 
-    /// One after the other, each with what came before it.
+    /// A chain of actions, each of which uses the ones before it.
     fn chain(&mut self, room: &Room, visible: &Visible) -> Vec<StateId> {
         let mut visible = visible.clone();
         let mut children = Vec::new();
@@ -27,7 +28,7 @@ impl Maker {
             let id = self.push(name.clone(), name, Some(Program::ROOT));
             let kind = self.action(id, room, &visible);
             self.at(id).kind = kind;
-            // Custom outcomes would leave the task, most of the time before its middle.
+            // Custom outcomes would usually leave the task before its middle.
             self.at(id).outcomes.clear();
             self.only_usual_effects(id);
             let next = number + 1 < CHAIN;
@@ -52,7 +53,7 @@ impl Maker {
         inner.variables.push("n".to_owned());
         let mut body = Vec::new();
         if self.dice.percent(50) {
-            // Each of them makes a number of the number before.
+            // Each computes a number from the number before.
             body = self.counting(id, "loop", room, &inner, facts::COUNTER);
             body.truncate(3);
             self.states.truncate(body.last().map_or(0, |last| last.0 as usize + 1));
@@ -63,7 +64,7 @@ impl Maker {
             let kind = self.action(part, room, &inner);
             self.at(part).kind = kind;
             self.at(part).outcomes.clear();
-            // There are not so many of these.
+            // There are not enough of these resources.
             self.at(part).annotations.resources.retain(|resource| resource.kind != PART);
             self.only_usual_effects(part);
             inner.ports.push(part);

@@ -1,7 +1,7 @@
-//! Outputs of conditions, loops and concurrencies, what different ways give, and who uses that.
+//! Outputs of conditions, loops and concurrencies, with values that depend on the way taken, and their users.
 //!
-//! They are added to a program that is there: what its states read is said in another way, or they read something more. So the programs of
-//! older features stay what they are.
+//! They are added to a finished program: inputs are replaced, or further inputs are added. So the programs of older features do not
+//! change.
 
 use super::super::{Dice, around, is_preemptive};
 use ratn_model::expression::{BinaryOperator, EffectExpr, Expr, Function};
@@ -12,16 +12,16 @@ use ratn_model::program::{Program, State, StateKind, TaskOutput};
 use ratn_model::value::{Type, Value};
 use std::collections::BTreeMap;
 
-/// What a loop collects.
+/// The output in which a loop collects values.
 const ALL: &str = "all";
-/// What every state puts out that puts out anything.
+/// The output that every state with outputs has.
 const X: &str = "x";
-/// More states than this do not use an output.
+/// Limit of the users of an output.
 const MOST_USERS: u64 = 3;
 
-/// Some states get outputs, and some use them.
+/// Adds outputs to some states, and users of them to some others.
 pub(super) fn add(program: &mut Program, guards: &mut BTreeMap<StateId, Guard>, dice: &mut Dice) {
-    // What a state contains comes after it: the inner ones get theirs first.
+    // Inner states have larger ids, so they get their outputs first.
     for id in (1..program.states.len() as u64).rev().map(StateId) {
         let inside = givers(program, id);
         if inside.is_empty() || !dice.percent(75) {
@@ -51,7 +51,7 @@ pub(super) fn add(program: &mut Program, guards: &mut BTreeMap<StateId, Guard>, 
     }
 }
 
-/// Inside of a state of a loop, what that has put out in the iteration before is used.
+/// States inside of a composite state in a loop use its output of the iteration before.
 pub(super) fn of_the_iteration_before(program: &mut Program, dice: &mut Dice) {
     let is_again = |state: &State| around(program, state).skip(1).any(State::is_loop);
     let gives = |state: &&State| state.outputs().iter().any(|output| output.name == X);
@@ -76,7 +76,7 @@ pub(super) fn of_the_iteration_before(program: &mut Program, dice: &mut Dice) {
     }
 }
 
-/// The states directly inside of one that have an output `x`.
+/// The direct children of a state that have an output `x`.
 fn givers(program: &Program, id: StateId) -> Vec<StateId> {
     let gives = |state: &&State| match &state.kind {
         StateKind::Action { outputs, .. } => outputs.contains_key(X),
@@ -85,7 +85,7 @@ fn givers(program: &Program, id: StateId) -> Vec<StateId> {
     program.state(id).children().map(|child| program.state(child)).filter(gives).map(|state| state.id).collect()
 }
 
-/// What one of some states gives: the first of those that were come to; seldom nothing is said of what it is where none was.
+/// The output of one of several states: the first one that was written; in a few cases without a default for the case that none was.
 fn chosen(from: &[StateId], dice: &mut Dice) -> Expr {
     let port = |state: StateId| Expr::Port { state, port: X.to_owned() };
     let mut rest = from.to_vec();
@@ -108,7 +108,7 @@ fn chosen(from: &[StateId], dice: &mut Dice) -> Expr {
     }
 }
 
-/// A loop collects something of each iteration.
+/// A loop collects a value of each iteration.
 fn collect(state: &mut State, guards: &mut BTreeMap<StateId, Guard>, inside: &[StateId], dice: &mut Dice) {
     let value = match &state.kind {
         StateKind::ForEach { variable, .. } if dice.percent(30) => Expr::Variable(variable.clone()),
@@ -123,7 +123,7 @@ fn collect(state: &mut State, guards: &mut BTreeMap<StateId, Guard>, inside: &[S
     guards.entry(state.id).or_default().collected.push(Collected { name: ALL.to_owned(), value });
 }
 
-/// What comes behind a state in its list uses what it gives, and so may the task.
+/// States behind a state in its list use its output, and so may the task.
 fn use_it(program: &mut Program, (from, port): (StateId, &str), dice: &mut Dice) {
     let Some(parent) = program.state(from).parent else { return };
     let siblings = program.state(parent).list_of(from).to_vec();

@@ -1,16 +1,17 @@
-//! Shapes that chance hardly ever makes and in which bugs hid.
+//! Shapes that chance hardly ever makes and in which bugs were found.
 //!
-//! - *Looked twice*: somebody looks and writes nothing yet; the motion before comes out otherwise, they look again and write
-//!   something; whoever read that nothing was there must read again. The list is empty, or an outcome without effects came
-//!   first, or the key is another; the reader looks by a wildcard, `exists`, or a query.
-//! - *Counting*: motions and computations that each make a number of the number before, with readers among them.
+//! - *Looked twice*: a writer reads and writes nothing at first. An older motion comes out otherwise, so it reads again and
+//!   now writes something. Readers that found nothing must read again. It wrote nothing because its list was empty, because
+//!   an outcome without effects came first, or because the key was another one; the reader uses a wildcard, `exists`, or a
+//!   query.
+//! - *Counting*: motions and computations that each compute a number from the number before, with readers among them.
 //! - *A counting loop*: the same in a loop.
-//! - *Keys*: a chain of writers, the keys of each from the port of the one before.
+//! - *Keys*: a chain of writers, each with keys from the port of the one before.
 
 use super::*;
 use ratn_model::program::{Nature, WORLD_MODEL};
 
-/// What one link of a chain is.
+/// One link of a chain.
 struct Link {
     nature: Nature,
     reads: Vec<FactExpr>,
@@ -32,7 +33,7 @@ impl Link {
         Link { effects, ..self }
     }
 
-    /// It takes so long that what is behind it is computed meanwhile.
+    /// Makes it take so long that later nodes are computed meanwhile.
     fn slowly(self) -> Link {
         Link { duration_s: Some(20.0), ..self }
     }
@@ -51,12 +52,11 @@ fn one() -> Expr {
     Expr::Literal(Value::Int(1))
 }
 
-/// Every fact of a predicate.
 fn every(predicate: u64) -> FactExpr {
     FactExpr { predicate: format!("p{predicate}"), arguments: vec![None; facts::arity(predicate)] }
 }
 
-/// A fact whose first argument is this.
+/// A fact with this first argument.
 fn of(predicate: u64, first: Expr) -> FactExpr {
     let mut fact = every(predicate);
     fact.arguments.iter_mut().for_each(|argument| *argument = Some(Expr::Literal(Value::Int(0))));
@@ -67,7 +67,7 @@ fn of(predicate: u64, first: Expr) -> FactExpr {
 }
 
 impl Maker {
-    /// One of the patterns as a hierarchy or a loop; nothing where there is no room for one.
+    /// One of the patterns as a hierarchy or a loop; `None` if there is no room for one.
     pub(super) fn pattern(&mut self, id: StateId, path: &str, room: &Room, visible: &Visible) -> Option<StateKind> {
         let both: Vec<u64> = room.writable.iter().copied().filter(|p| room.readable.contains(p)).collect();
         let first = self.dice.one_of(&both).copied()?;
@@ -162,9 +162,9 @@ impl Maker {
             _ => Link { nature: Nature::Senses(vec![held]), ..Link::computes(Vec::new()) },
         };
         match self.dice.below(4) {
-            // What it writes is its own list.
+            // It writes facts with keys from its own list.
             0 => children.push(self.link(id, path, room, visible, look.writing(vec![each(own)]))),
-            // Its outcomes write different facts.
+            // Its outcomes have different effects.
             1 => {
                 let look = self.link(id, path, room, visible, look);
                 let state = self.at(look);
@@ -177,7 +177,7 @@ impl Maker {
                 state.transitions.insert(EMPTY.to_owned(), next);
                 children.push(look);
             }
-            // Somebody else writes what it saw.
+            // Another node writes what it saw.
             2 => {
                 let look = self.link(id, path, room, visible, look);
                 let list = Expr::Port { state: look, port: "list".to_owned() };
@@ -214,7 +214,7 @@ impl Maker {
         children
     }
 
-    /// Writers that make a number of the number before, and readers.
+    /// Writers that each compute a number from the number before, and readers.
     pub(super) fn counting(
         &mut self,
         id: StateId,
@@ -251,7 +251,7 @@ impl Maker {
         children
     }
 
-    /// A chain of writers, the keys of each from the port of the one before; then somebody reads them all.
+    /// A chain of writers, each with keys from the port of the one before; then a reader of them all.
     fn keys(
         &mut self,
         id: StateId,

@@ -3,7 +3,7 @@
 use super::*;
 
 impl Maker {
-    /// Two or three regions with facts, actuators and variables of their own.
+    /// Two or three regions, each with its own facts, actuators and variables.
     pub(super) fn barrier(&mut self, id: StateId, path: &str, depth: u64, room: &Room, visible: &Visible) -> StateKind {
         let count = 2 + self.dice.below(2) as usize;
         let shares = self.features.weak && self.dice.percent(50);
@@ -37,7 +37,7 @@ impl Maker {
         self.concurrency(id, regions, false, room, visible)
     }
 
-    /// Rooms of regions beside each other: what one may write no other one sees, unless they share it.
+    /// Rooms of concurrent regions: no region reads what another one may write, unless they share it.
     fn rooms(&mut self, count: usize, room: &Room, shares: bool) -> Vec<Room> {
         let mut rooms =
             vec![Room { is_alone: false, writable: Vec::new(), actuators: Vec::new(), ..room.clone() }; count];
@@ -47,7 +47,7 @@ impl Maker {
         for predicate in &room.writable {
             let owner = self.dice.below(count as u64 + 1) as usize;
             for (number, region) in rooms.iter_mut().enumerate() {
-                // Of nobody: all may read it.
+                // A predicate without owner may be read by all.
                 if (number == owner || owner == count) && !region.readable.contains(predicate) {
                     region.readable.push(*predicate);
                 }
@@ -71,7 +71,7 @@ impl Maker {
         let actuators = [vec!["Arm", "Base"], vec!["Head"]];
         let mut regions = Vec::new();
         let rooms = match self.features.ways_out {
-            // What the reference has a verdict on.
+            // Cases on which the reference has a verdict.
             true => self.rooms(actuators.len(), room, false),
             false => vec![room.clone(); actuators.len()],
         };

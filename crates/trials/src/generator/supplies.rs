@@ -1,4 +1,4 @@
-//! Resources that are chosen by what they are like, that are divisible, that others want as well, that do not come back.
+//! Resources that are selected by attributes, divisible, scarce, or not renewable.
 
 use super::*;
 use crate::{BATTERY, POWER};
@@ -7,7 +7,7 @@ use ratn_model::program::{Nature, ResourceExpr};
 use ratn_model::resource::Quantity;
 
 impl Maker {
-    /// What a node asks for besides.
+    /// Further resources that a node requires.
     pub(super) fn supplies(&mut self, annotations: &mut Annotations, room: &Room, visible: &Visible) {
         if !self.features.supplies {
             return;
@@ -28,7 +28,7 @@ impl Maker {
         }
     }
 
-    /// One of three, by its attributes; there always is one.
+    /// One of three tools, selected by its attributes; one always matches.
     fn tool(&mut self, visible: &Visible) -> ResourceExpr {
         let mut tool = block(TOOL);
         let condition = |comparison, value| ConditionExpr { attribute: "level".to_owned(), comparison, value };
@@ -60,7 +60,7 @@ impl Maker {
     }
 }
 
-/// A routine asks for all that it contains at once, and there are no two tools of a kind: in each, only one is asked for.
+/// A routine acquires everything inside at once, and no two tools are alike: each routine uses only one.
 pub(super) fn one_tool_per_routine(program: &mut Program) {
     let mut chosen: BTreeMap<StateId, ResourceExpr> = BTreeMap::new();
     for at in 0..program.states.len() {
@@ -70,7 +70,7 @@ pub(super) fn one_tool_per_routine(program: &mut Program) {
         let tools = program.states[at].annotations.resources.extract_if(.., |r| r.kind == TOOL);
         for tool in tools.collect::<Vec<_>>() {
             let same = chosen.entry(routine).or_insert_with(|| tool.clone()).selects_the_same(&tool);
-            // What a routine's tool is like is known before it begins: what is in it has no say.
+            // A routine's selectors are evaluated before it begins, so they must be constants.
             let is_constant = tool.attributes.iter().all(|(_, value)| matches!(value, Expr::Literal(_)));
             if same && is_constant {
                 program.states[at].annotations.resources.push(tool);

@@ -1,10 +1,10 @@
 //! A predicate that is measured within a tolerance, and ontologies.
 //!
-//! A node may then have seen the predicted value where HSM mode shows the measured one. So that both do the same all the same, what
-//! nodes see of this predicate is rounded to whole numbers by the oracle: predicted values are whole, measured ones are a whole
-//! number and at most [`OFF`] beside it, and nothing ever adds two of them up or copies one into another predicate. Whoever
-//! compares one does so with a number and a half, which is in the middle between two whole ones. The tolerance is between `OFF`
-//! and `1 - OFF`, so a value of another whole number is always another value, and one of the same never is.
+//! With a tolerance, a node may have seen the predicted value where HSM mode shows the measured one. So that both modes behave
+//! alike, the oracle rounds what nodes see of this predicate to whole numbers: predicted values are whole, measured ones are a
+//! whole number plus or minus at most [`OFF`], and no program adds two of them up or copies one into another predicate. Comparisons
+//! use a number and a half, which is midway between two whole numbers. The tolerance is between `OFF` and `1 - OFF`, so a value
+//! near another whole number always counts as different, and one near the same number never does.
 
 use super::*;
 use ratn_model::ontology::Ontology;
@@ -15,12 +15,11 @@ use std::sync::LazyLock;
 
 /// The predicate.
 pub(crate) const TOLERANT: u64 = 30;
-/// How far measured values are from whole numbers.
+/// Largest difference between measured values and whole numbers.
 pub(crate) const OFF: f64 = 0.2;
-/// The tolerance.
 const TOLERANCE: f64 = 0.3;
 
-/// The tolerance is said by the task, or by an ontology that has opinions about other facts, too.
+/// Declares the tolerance in the task, or in an ontology that also declares other facts.
 pub(super) fn declare(program: &mut Program, dice: &mut Dice) {
     if dice.percent(20) {
         program.ontology = Some(ONTOLOGY.clone());
@@ -39,7 +38,7 @@ static ONTOLOGY: LazyLock<Ontology> = LazyLock::new(|| {
         text +=
             &format!(":p{name} a ratn:Predicate{more} ; ratn:arguments ( {arguments} ) ; ratn:value \"{value}\" .\n");
     };
-    // The last two are read and deleted where there is nothing else to, and never written.
+    // The last two are read and deleted when there is nothing else to do, and never written.
     for predicate in 0..PREDICATES + 2 {
         declare(predicate, "owl:Thing", if predicate == 1 { "float" } else { "any" }, "");
     }
@@ -60,7 +59,7 @@ static ONTOLOGY: LazyLock<Ontology> = LazyLock::new(|| {
 });
 
 impl Maker {
-    /// Some nodes read, require and write the predicate.
+    /// Makes some nodes read, require and write the predicate.
     pub(super) fn tolerated(&mut self, annotations: &mut Annotations, room: &Room) {
         if !room.tolerant || room.is_preemptive {
             return;
@@ -101,7 +100,7 @@ impl Maker {
         }
     }
 
-    /// Whether a value is below a number and a half.
+    /// Compares a value with a number and a half.
     pub(super) fn tolerated_comparison(&mut self) -> Expr {
         let key = Some(Expr::Literal(Value::Int(self.dice.below(2) as i64)));
         let fact = FactExpr { predicate: format!("p{TOLERANT}"), arguments: vec![key] };

@@ -1,10 +1,10 @@
-//! Parameters, scoped variables and what is assigned to them.
+//! Parameters, scoped variables and assignments to them.
 
 use super::*;
 use ratn_model::program::Parameter;
 
 impl Maker {
-    /// Scoped variables of a sequence, visible inside from here on.
+    /// Adds scoped variables to a sequence; they are visible inside from here on.
     pub(super) fn variables(&mut self, id: StateId, room: &Room, visible: &mut Visible) -> Vec<(String, Expr)> {
         if !self.features.variables || !self.dice.percent(35) {
             return Vec::new();
@@ -22,7 +22,7 @@ impl Maker {
         vec![(name, value)]
     }
 
-    /// A fact's value, 0 where there is none.
+    /// A fact's value, or 0 if it is absent.
     pub(super) fn number_of_fact(&mut self, room: &Room) -> Expr {
         if self.features.facts && !self.features.blind && self.dice.percent(30) {
             let query = self.query(room, &Visible::default());
@@ -47,7 +47,7 @@ impl Maker {
         vec![(name, value)]
     }
 
-    /// Parameters of the task, seen everywhere but in libraries.
+    /// Parameters of the task, visible everywhere except in libraries.
     pub(super) fn parameters(&mut self, visible: &mut Visible) -> Vec<Parameter> {
         if !self.features.libraries || !self.dice.percent(40) {
             return Vec::new();
@@ -57,7 +57,7 @@ impl Maker {
         vec![Parameter { name, ty: Type::Any, default: Some(Value::Int(self.dice.below(ARGUMENTS) as i64)) }]
     }
 
-    /// The parameters of a library: scoped variables of its own, made of what is seen where it is used.
+    /// The parameters of a library: its scoped variables, with values from the names visible where it is used.
     pub(super) fn given(&mut self, id: StateId, room: &Room, visible: &Visible) -> (Vec<(String, Expr)>, Visible) {
         let mut inner = Visible::default();
         let mut given = Vec::new();

@@ -1,6 +1,6 @@
-//! States that wait. A condition is about facts that only its own region may write, so that what makes it hold comes at one place of
-//! the program; of regions that share what they write (only where the runs need not end alike) about those, too. A signal has a name of
-//! its own for each state.
+//! States that wait. A condition uses facts that only its own region may write, so that it becomes true at one place of the program.
+//! Where regions share facts, it may use these, too (only if the runs need not end alike). Each state that waits for a signal has its
+//! own signal name.
 
 use super::*;
 use ratn_model::program::CLOCK;
@@ -63,14 +63,14 @@ impl Maker {
         StateKind::Action { provider: CLOCK.to_owned(), action: action.to_owned(), inputs, outputs }
     }
 
-    /// One fact or two, with arguments and values that are constants.
+    /// A condition on one or two facts, with constant arguments and values.
     fn awaited_condition(&mut self, room: &Room) -> Expr {
         let place = self.dice.below(room.writable.len() as u64) as usize;
         let first = self.awaited_fact(room.writable[place]);
         if room.writable.len() == 1 || self.dice.percent(60) {
             return first;
         }
-        // Of another predicate: two that exclude each other would be waited for without an end.
+        // With another predicate, because two conditions that exclude each other would never become true.
         let second = self.awaited_fact(room.writable[(place + 1) % room.writable.len()]);
         Expr::Binary(BinaryOperator::And, Box::new(first), Box::new(second))
     }

@@ -1,4 +1,4 @@
-//! Motions and hierarchies that are watched: a condition must hold from their start to their end.
+//! Motions and hierarchies with `while` conditions.
 
 use super::super::{Dice, PREDICATES, around};
 use super::fact_at;
@@ -9,7 +9,7 @@ use ratn_model::program::{ABORTED, Nature, Program, State, StateKind, Target, VI
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 
-/// Some motions of a program are watched. Regions are left as they are: others may write there what is watched.
+/// Adds `while` conditions to some motions. Regions are left out, because other regions may write the facts there.
 pub(super) fn watch(program: &mut Program, guards: &mut BTreeMap<StateId, Guard>, dice: &mut Dice) {
     let beside = |state: &State| around(program, state).any(|out| matches!(out.kind, StateKind::Concurrency { .. }));
     let moves = |state: &State| {
@@ -47,7 +47,7 @@ pub(super) fn watch(program: &mut Program, guards: &mut BTreeMap<StateId, Guard>
     }
 }
 
-/// One that holds more often than not.
+/// A condition that is true more often than not.
 fn condition(dice: &mut Dice) -> Expr {
     let fact = fact_at(dice.below(PREDICATES), 0);
     let less = Expr::Binary(

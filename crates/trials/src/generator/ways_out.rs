@@ -1,7 +1,6 @@
-//! What is done on every way out of some more states, those inside of races, limits and regions included, and what being cut short did to
-//! the world.
+//! `finally` of further states, including states inside of races, timeouts and regions, and effects for the outcome `preempted`.
 //!
-//! What is done is what some action of the same region does, without what it was given: so it touches nothing that the region does not.
+//! A `finally` contains a copy of an action of the same region, without its inputs, so it uses nothing that the region does not use.
 
 use super::super::oracle::LONG_S;
 use super::super::{BATTERY, Dice, POWER, RESOURCES, TOOL, around};
@@ -13,10 +12,10 @@ use ratn_model::resource::ResourceOperation;
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 
-/// More states than this a program does not get.
+/// Limit of additional states.
 const MOST: usize = 6;
 
-/// Some states of a program get something to do on every way out, and some say what being cut short means.
+/// Adds a `finally` to some states, and effects for `preempted` to some.
 pub(super) fn add(program: &mut Program, guards: &mut BTreeMap<StateId, Guard>, dice: &mut Dice) {
     let is_action = |state: &State| matches!(state.kind, StateKind::Action { .. }) && !state.is_pause();
     let donors: Vec<StateId> =
@@ -42,10 +41,10 @@ pub(super) fn add(program: &mut Program, guards: &mut BTreeMap<StateId, Guard>, 
     }
     for id in ids {
         let state = program.state(id);
-        // A composite state writes what something inside of it writes.
+        // A composite state may write what a state inside of it writes.
         let inside = program.states.iter().filter(|other| around(program, other).any(|out| out.id == id));
         let written: Vec<FactExpr> = inside.filter(|other| is_action(other)).filter_map(writes).collect();
-        // What computes or senses changes nothing when it fails.
+        // A computing or sensing state changes nothing when it fails.
         let changes = !is_action(state) || state.annotations.nature == Nature::Irreversible;
         let says = dice.percent(40) && changes && !state.annotations.effects.contains_key(PREEMPTED);
         let Some(fact) = dice.one_of(&written).cloned().filter(|_| says) else { continue };
@@ -54,7 +53,7 @@ pub(super) fn add(program: &mut Program, guards: &mut BTreeMap<StateId, Guard>, 
     }
 }
 
-/// Some states get a limit of their time: such as are beside nothing, and in which nobody waits for what somebody else has.
+/// Adds timeouts to states without concurrent neighbours, in which no state waits for what another one holds.
 fn limit(program: &mut Program, guards: &mut BTreeMap<StateId, Guard>, dice: &mut Dice) {
     let is_concurrent = |state: &State| matches!(state.kind, StateKind::Concurrency { .. });
     let mut limited: Vec<StateId> = Vec::new();
@@ -76,17 +75,17 @@ fn limit(program: &mut Program, guards: &mut BTreeMap<StateId, Guard>, dice: &mu
             }
         }
         let limits = guards.entry(id).or_default().limits.get_or_insert_default();
-        // Never when an action ends.
+        // Never at the end of an action.
         limits.timeout_s = Some(LONG_S * dice.below(4) as f64 + LONG_S / 20.0);
     }
 }
 
-/// A state and what it contains.
+/// The states inside of a state, including itself.
 fn inside(program: &Program, id: StateId) -> impl Iterator<Item = &State> {
     program.states.iter().filter(move |state| around(program, state).any(|out| out.id == id))
 }
 
-/// Whether something in a state may wait for what something beside it has.
+/// Whether a state inside may wait for something that a concurrent one holds.
 fn contend(program: &Program, id: StateId) -> bool {
     let concurrencies = inside(program, id).filter(|state| matches!(state.kind, StateKind::Concurrency { .. }));
     concurrencies.into_iter().any(|concurrency| {
@@ -103,7 +102,6 @@ fn contend(program: &Program, id: StateId) -> bool {
     })
 }
 
-/// The region that a state is inside of.
 fn region_of(program: &Program, id: StateId) -> Option<StateId> {
     let is_region = |state: &&State| {
         state.parent.is_some_and(|parent| matches!(program.state(parent).kind, StateKind::Concurrency { .. }))
@@ -111,7 +109,7 @@ fn region_of(program: &Program, id: StateId) -> Option<StateId> {
     around(program, program.state(id)).find(is_region).map(|region| region.id)
 }
 
-/// Whether nothing in a state names a variable, an output or a state, and it uses nothing up.
+/// Whether nothing in a state refers to a variable, an output or another state, and it consumes nothing.
 fn is_closed(state: &State) -> bool {
     let mut bare = bared(state.clone());
     let mut names = false;
@@ -123,7 +121,7 @@ fn is_closed(state: &State) -> bool {
     !names && state.annotations.resources.iter().all(|resource| resource.operation == ResourceOperation::Block)
 }
 
-/// A state without what it is given and assigns.
+/// A state without its inputs and assignments.
 fn bared(mut state: State) -> State {
     if let StateKind::Action { inputs, .. } = &mut state.kind {
         inputs.clear();
@@ -135,7 +133,7 @@ fn bared(mut state: State) -> State {
     state
 }
 
-/// Does what another state does, on the way out of this one. What the other may end by leads on.
+/// Adds a copy of a state as `finally` of another one; all its outcomes lead on.
 fn copy(program: &mut Program, donor: StateId, of: StateId) -> StateId {
     let id = StateId(program.states.len() as u64);
     let mut state = bared(program.state(donor).clone());
@@ -148,7 +146,7 @@ fn copy(program: &mut Program, donor: StateId, of: StateId) -> StateId {
     id
 }
 
-/// A fact without variables that an action writes when it succeeds.
+/// A fact without variables that an action writes with success.
 fn writes(state: &State) -> Option<FactExpr> {
     let is_fixed = |fact: &&FactExpr| fact.arguments.iter().all(|arg| matches!(arg, Some(Expr::Literal(_))));
     let effects = state.annotations.effects.get(SUCCESS)?;

@@ -1,14 +1,14 @@
-//! What is in force for a state by what it says and what its action says: the rule of docs/task-files.md, evaluated here once more.
+//! The annotations in force for a state, from its own and its action's annotations: the rule of docs/task-files.md, implemented here independently.
 //!
-//! A state's word under a key stands in place of its action's; `effects` add up, predicate by predicate. What needs an input that the state does not
-//! give is not in force.
+//! A state's annotation replaces its action's under the same key; `effects` are combined by predicate. An annotation that needs an input which the
+//! state does not give is not in force.
 
 use ratn_model::expression::{EffectExpr, Expr, FactExpr};
 use ratn_model::program::{ABORTED, Annotations, Nature, PREEMPTED, ResourceExpr, SUCCESS, WORLD_MODEL};
 use ratn_model::resource::ResourceOperation;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// What is said of an action, by a state or by its catalogue; nothing under a key that is not there.
+/// The annotations of a state or of an action in the catalogue; `None` for a missing key.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Said {
     pub(super) nature: Option<Nature>,
@@ -19,10 +19,10 @@ pub(super) struct Said {
     pub(super) duration: Option<Expr>,
 }
 
-/// What a state gives the inputs of its action.
+/// The state's expressions for the inputs of its action.
 pub(super) type Inputs = BTreeMap<String, Expr>;
 
-/// What is in force. `outcomes` are the action's own; `is_in_projection`: a state around has room for a projection.
+/// The annotations in force. `outcomes` are the action's own; `is_in_projection`: a state around it has room for a projection.
 pub(super) fn in_force(
     state: &Said,
     action: &Said,
@@ -65,7 +65,7 @@ pub(super) fn in_force(
     all
 }
 
-/// What a state changes, by outcome, as far as anything is said of that.
+/// The effects of a state by outcome, as far as they are declared.
 fn effects(state: &Said, action: &Said, given: &Inputs) -> BTreeMap<String, Vec<EffectExpr>> {
     let of_action = action.effects.as_ref().and_then(|effects| effects.get(SUCCESS));
     let Some(own) = &state.effects else {
@@ -115,7 +115,7 @@ fn effect(effect: &EffectExpr, given: &Inputs) -> Option<EffectExpr> {
     is_known.then_some(effect)
 }
 
-/// An expression of an action, with what the state gives in place of inputs; none where it needs what the state does not give.
+/// An expression of an action with the state's inputs inserted; `None` if it needs a missing input.
 fn replaced(expression: &Expr, given: &Inputs) -> Option<Expr> {
     let mut is_known = true;
     let mut expression = expression.clone();

@@ -1,8 +1,8 @@
-//! Random programs whose actions say in the catalogue what their states would, so that these say only what differs.
+//! Random programs whose annotations are partly in the catalogue, so that states contain only what differs.
 //!
-//! A random program is written as a task file. Of each of its actions some annotations are said by the state, some by its action, some by both; an
-//! action speaks of its own inputs, and now and then of one that the state does not give. What is then in force is evaluated here once more
-//! (`in_force`), and the loader has to come to the same; and the loaded program is one as any other, for both modes and the reference.
+//! A random program is written as a task file. Each annotation is put into the state, into its action, or into both; an action's annotations refer
+//! to its own inputs, sometimes to one that the state does not give. The annotations in force are computed here independently (`in_force`), and
+//! the loader must find the same. The loaded program is then tested as any other, in both modes and against the reference.
 
 mod in_force;
 mod written;
@@ -18,23 +18,23 @@ use ratn_model::value::Type;
 use serde_json::{Map, Value as Json, json};
 use std::collections::BTreeMap;
 
-/// What came of a random program with inherited annotations.
+/// The result for a random program with inherited annotations.
 #[derive(Debug)]
 pub enum Inherited {
-    /// It loads, and this is in force where it was to be.
+    /// It was loaded, with the expected annotations in force.
     Program(Box<Program>),
-    /// The rules refuse it, as they do some random programs.
+    /// The rules of `check` refuse it, as they do for some random programs.
     Refused(Vec<String>),
-    /// Something else is in force than should be: of which state, and what.
+    /// Other annotations are in force than expected: the state, and the difference.
     Differs(String),
 }
 
-/// So many of a hundred annotations are said by the action, by the state, by both.
+/// Percentages of annotations that are put into the action, the state, or both.
 const SHARES: [u64; 3] = [45, 35, 20];
 /// An input of every action that no state gives.
 const NEVER_GIVEN: &str = "never";
 
-/// The random program of a seed, written with a catalogue that says a part of it, and loaded.
+/// The random program of a seed, written with a catalogue that contains a part of its annotations, and loaded.
 pub fn inherited(seed: u64) -> Inherited {
     let mut program = generator::program(seed, &Features::INHERITED);
     let mut dice = Dice(seed ^ 0x1e_4e71_7ed0);
@@ -86,7 +86,7 @@ pub fn inherited(seed: u64) -> Inherited {
     Inherited::Program(Box::new(loaded))
 }
 
-/// Every action has a name of its own, and is one of what performs it.
+/// Gives every action its own name, with the provider of its resource.
 fn name_actions(program: &mut Program) {
     for state in &mut program.states {
         let performer = performer(&state.annotations).to_lowercase();
@@ -96,13 +96,13 @@ fn name_actions(program: &mut Program) {
     }
 }
 
-/// The kind of the resource that performs an action: the first that it blocks.
+/// The resource kind of an action's provider: the first that it blocks.
 fn performer(annotations: &Annotations) -> &str {
     let blocks = |line: &&ResourceExpr| line.operation == ResourceOperation::Block;
     annotations.resources.iter().find(blocks).map_or("Planner", |line| &line.kind)
 }
 
-/// As a state says it that says all of it, to compare.
+/// All annotations as a state would have them, for comparison.
 fn as_said(program: &Program, state: &State, all: &Annotations) -> String {
     let said = Said {
         nature: Some(all.nature.clone()),
@@ -116,7 +116,7 @@ fn as_said(program: &Program, state: &State, all: &Annotations) -> String {
     Json::Object(said_by_state(program, &state, &said)).to_string()
 }
 
-/// Who says what of all that is said of a state: the state, and its action in terms of its inputs.
+/// Divides a state's annotations between the state and its action, the latter in terms of its inputs.
 fn divided(all: &Annotations, given: &Inputs, dice: &mut Dice) -> (Said, Said) {
     let (mut state, mut action) = (Said::default(), Said::default());
     let who = |dice: &mut Dice| {
@@ -130,7 +130,7 @@ fn divided(all: &Annotations, given: &Inputs, dice: &mut Dice) -> (Said, Said) {
     }
     if of_action {
         action.nature = match &all.nature {
-            // Nothing in its catalogue says that an action moves: that it is no other is.
+            // A catalogue cannot say `irreversible`. It says `computes` only if the state overrides that.
             Nature::Irreversible => own.then_some(Nature::Computes),
             Nature::Computes => Some(Nature::Computes),
             Nature::Senses(facts) => of_inputs(facts, given).filter(|facts| !facts.is_empty()).map(Nature::Senses),
@@ -167,7 +167,7 @@ fn divided(all: &Annotations, given: &Inputs, dice: &mut Dice) -> (Said, Said) {
         action.duration = in_terms_of(duration, given).filter(|_| of_action);
         state.duration = (own || action.duration.is_none()).then(|| duration.clone());
     }
-    // What only computes has no effects, by its own word.
+    // A computing action has no effects in the catalogue.
     if action.nature == Some(Nature::Computes) && action.effects.as_ref().is_some_and(has_some) {
         state.effects = Some(all.effects.clone());
         action.effects = None;
@@ -179,7 +179,7 @@ fn has_some(effects: &BTreeMap<String, Vec<EffectExpr>>) -> bool {
     effects.values().any(|effects| !effects.is_empty())
 }
 
-/// An action says what some predicates become with success, the state the rest: of those predicates, too, now and then.
+/// Divides the effects: the action gets those of success on some predicates, the state the others, sometimes also on these predicates.
 fn divide_effects(all: &Annotations, given: &Inputs, dice: &mut Dice, state: &mut Said, action: &mut Said) {
     let Some(success) = all.effects.get(SUCCESS) else {
         state.effects = (!all.effects.is_empty()).then(|| all.effects.clone());
@@ -213,7 +213,7 @@ fn divide_effects(all: &Annotations, given: &Inputs, dice: &mut Dice, state: &mu
     action.effects = says.then(|| BTreeMap::from([(SUCCESS.to_owned(), of_action)]));
 }
 
-/// An action can only say of which kinds it blocks one, its performer's among them.
+/// Divides the resources: an action can only block one unit of a kind, including its provider's kind.
 fn divide_resources(all: &Annotations, dice: &mut Dice, state: &mut Said, action: &mut Said) {
     let plain = |line: &ResourceExpr| {
         *line == ResourceExpr { kind: line.kind.clone(), ..ResourceExpr::new(ResourceOperation::Block, "") }
@@ -244,7 +244,7 @@ fn of_inputs(facts: &[FactExpr], given: &Inputs) -> Option<Vec<FactExpr>> {
 }
 
 fn effect_in_terms_of(effect: &EffectExpr, given: &Inputs) -> Option<EffectExpr> {
-    // A text in a catalogue is one effect.
+    // A catalogue contains only single effects.
     if matches!(effect, EffectExpr::ForEach { .. }) {
         return None;
     }
@@ -256,7 +256,7 @@ fn effect_in_terms_of(effect: &EffectExpr, given: &Inputs) -> Option<EffectExpr>
     is_known.then_some(effect)
 }
 
-/// An expression of a state in terms of what it gives the inputs of its action; none where it names anything else.
+/// A state's expression in terms of its action's inputs; `None` if it uses anything else.
 fn in_terms_of(expression: &Expr, given: &Inputs) -> Option<Expr> {
     let is_simple = |given: &Expr| matches!(given, Expr::Variable(_) | Expr::Port { .. });
     let (mut expression, mut is_known) = (expression.clone(), true);
@@ -271,7 +271,7 @@ fn in_terms_of(expression: &Expr, given: &Inputs) -> Option<Expr> {
     is_known.then_some(expression)
 }
 
-/// The keys of a task file.
+/// A state's annotations as keys of a task file.
 fn said_by_state(program: &Program, state: &State, said: &Said) -> Map<String, Json> {
     let mut keys = Map::new();
     keys.extend(said.nature.as_ref().map(|nature| written::nature(program, nature)));
@@ -296,7 +296,7 @@ fn said_by_state(program: &Program, state: &State, said: &Said) -> Map<String, J
     keys
 }
 
-/// The texts of a catalogue.
+/// Annotations as texts of a catalogue.
 fn said_by_action(said: &Said) -> OfAction {
     let texts = |facts: &Vec<FactExpr>| facts.iter().map(ToString::to_string).collect::<Vec<_>>();
     let kind =

@@ -1,4 +1,4 @@
-//! A program as a task file, in JSON, which YAML reads: every state with all that it says itself. What is said of actions is given.
+//! A program as a task file in JSON, which is valid YAML: every state with its own annotations. Those of actions are given.
 
 use super::super::{around, offers};
 use ratn_model::expression::{EffectExpr, Expr, FactExpr};
@@ -7,7 +7,7 @@ use ratn_model::resource::{Quantity, ResourceOperation};
 use serde_json::{Map, Value as Json, json};
 use std::collections::BTreeMap;
 
-/// The task file of a program; `action` says, of an action, what its state says.
+/// The task file of a program; `action` returns the keys of an action's state.
 pub(super) fn task(program: &Program, action: &dyn Fn(&State) -> Map<String, Json>) -> String {
     let root = program.state(Program::ROOT);
     let mut task = Map::new();
@@ -107,7 +107,7 @@ fn state(program: &Program, state: &State, action: &dyn Fn(&State) -> Map<String
     json!({ state.name.clone(): said })
 }
 
-/// What a state with states inside says of itself.
+/// Adds the keys of a composite state.
 fn boundary(program: &Program, state: &State, said: &mut Map<String, Json>) {
     let annotations = &state.annotations;
     if !annotations.requires.is_empty() {
@@ -180,14 +180,13 @@ pub(super) fn text(program: &Program, expression: &Expr) -> String {
     expression.to_string()
 }
 
-/// States stand by their names.
+/// Replaces the ids of states by their names.
 fn say_states(program: &Program, part: &mut Expr) {
     if let Expr::Port { state, port } = part {
         *part = Expr::Output(format!("{}.{port}", program.state(*state).name));
     }
 }
 
-/// The kinds of resources that there are, for a catalogue.
 pub(super) fn resources() -> BTreeMap<String, ratn_model::catalogue::ResourceOffer> {
     let actuates = |kind: &str| ["Arm", "Head", "Base"].contains(&kind);
     let offer = |(kind, mut offer): (String, ratn_model::catalogue::ResourceOffer)| {

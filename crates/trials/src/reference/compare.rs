@@ -1,4 +1,4 @@
-//! What a run did beside what it should have done.
+//! Compares a run with the reference.
 
 use super::ReferenceResult;
 use crate::state_of;
@@ -8,10 +8,10 @@ use ratn_model::value::Value;
 use ratn_simulation::run::Run;
 use std::collections::BTreeMap;
 
-/// The goals of PIAs in order, by thread of control.
+/// The goals of PIAs, in order, by thread of control.
 type Threads<'a> = BTreeMap<String, Vec<(&'a str, &'a str)>>;
 
-/// The first thing that a run did otherwise.
+/// The first difference of a run from the reference.
 pub(in super::super) fn disagreement(
     program: &Program,
     wanted: &ReferenceResult,
@@ -23,7 +23,7 @@ pub(in super::super) fn disagreement(
     })
 }
 
-/// Whatever does not depend on the world: how the task and its actions ended.
+/// Differences that do not depend on the world: how the task and its actions ended.
 pub(in super::super) fn outcomes(wanted: &ReferenceResult, run: &Run, story: &Story) -> Option<String> {
     task(wanted, run).or_else(|| results(wanted, story))
 }
@@ -53,7 +53,8 @@ pub(in super::super) fn end(wanted: &ReferenceResult, run: &Run) -> Option<Strin
     (left != found).then(|| differ("task resources", left, found))
 }
 
-/// Whether a run that was told to end did just this: outcome, PIAs, changes, world. What stands for task resources depends on who was asked meanwhile.
+/// Whether a run that was told to end did exactly this: outcome, PIAs, changes, world. Task resources are not compared, because they depend on
+/// requests under way.
 pub(in super::super) fn is_cut(program: &Program, wanted: &ReferenceResult, run: &Run, story: &Story) -> bool {
     wanted.outcome == run.outcome
         && acts(program, wanted, story).is_none()

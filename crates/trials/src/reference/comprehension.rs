@@ -1,4 +1,4 @@
-//! `filter`, `map`, `sort_by` and others, read element by element.
+//! `filter`, `map`, `sort_by` and others, evaluated element by element.
 
 use super::Fail;
 use super::evaluate::{Place, Read, number, order, wrong};
@@ -6,7 +6,7 @@ use ratn_model::expression::{Comprehension, Expr};
 use ratn_model::value::Value;
 use std::cmp::Ordering;
 
-/// What a comprehension makes of its list.
+/// The value of a comprehension.
 pub(super) fn read(
     (what, element): (Comprehension, &str),
     (list, body): (&Expr, &Expr),
@@ -25,7 +25,7 @@ pub(super) fn read(
             Comprehension::Filter | Comprehension::Any | Comprehension::All => Value::Bool(body.is_true(&inside)?),
             _ => body.read(&inside)?,
         };
-        // What is decided is looked at no further.
+        // Later elements are not evaluated once the result is known.
         match (what, &key) {
             (Comprehension::Any, Value::Bool(true)) => return Ok(Value::Bool(true)),
             (Comprehension::All, Value::Bool(false)) => return Ok(Value::Bool(false)),
@@ -60,7 +60,7 @@ pub(super) fn read(
     }
 }
 
-/// The second of each pair, by insertion in the order of the first.
+/// Insertion sort of pairs by their first values; returns the second ones.
 pub(super) fn ascending(keyed: Vec<(Value, Value)>) -> Result<Vec<Value>, Fail> {
     let real = keyed.iter().any(|(key, _)| matches!(key, Value::Float(_)));
     let mut sorted: Vec<(Value, Value)> = Vec::new();

@@ -1,7 +1,7 @@
-//! What the effects of a state come to, and what facts become by them.
+//! Evaluates the effects of a state and applies them to facts.
 //!
-//! Values and arguments are read before anything changes. Where two effects of one list are about the same fact, the documents do
-//! not say which counts; both modes make them in the order of the list, and so does this.
+//! Values and arguments are evaluated before anything changes. If two effects of one list concern the same fact, the documents do
+//! not say which one counts; both modes apply them in the order of the list, and so does this.
 
 use super::Fail;
 use super::evaluate::{Place, Read};
@@ -11,7 +11,7 @@ use ratn_model::fact::{Change, FactKey, Term};
 use ratn_model::ontology::Ontology;
 use ratn_model::value::Value;
 
-/// The changes that effects are, in order.
+/// The changes of the effects, in order.
 pub(super) fn bound(effects: &[EffectExpr], place: &Place<'_>) -> Result<Vec<Change>, Fail> {
     let mut changes = Vec::new();
     for effect in effects {
@@ -40,7 +40,7 @@ pub(super) fn bound(effects: &[EffectExpr], place: &Place<'_>) -> Result<Vec<Cha
     Ok(changes)
 }
 
-/// Each measured value in the place of the predicted one. `declared`: what is not predicted may not be measured.
+/// Replaces predicted values by measured ones. With `declared`, a fact that is not predicted must not be measured.
 pub(super) fn with_measured(
     mut changes: Vec<Change>,
     measured: &[(FactKey, Value)],
@@ -67,7 +67,6 @@ pub(super) fn with_measured(
     Ok(changes)
 }
 
-/// The facts after changes.
 pub(super) fn applied(before: &Facts, changes: &[Change], ontology: Option<&Ontology>) -> Result<Facts, Fail> {
     if let Some(ontology) = ontology {
         ontology.check_changes(changes).map_err(|violation| Fail::Wrong(violation.to_string()))?;
@@ -98,7 +97,7 @@ pub(super) fn applied(before: &Facts, changes: &[Change], ontology: Option<&Onto
             }
         }
     }
-    // Of the facts of a functional predicate about one subject, one holds at most.
+    // Among the facts of a functional predicate for one subject, at most one holds.
     let holds = |value: &Value| !matches!(value, Value::Null | Value::Bool(false));
     for change in changes {
         let (Some(ontology), Change::Set { fact, .. }) = (ontology, change) else { continue };

@@ -1,4 +1,4 @@
-//! Expressions, read at a place of the program.
+//! Evaluates expressions at a place of the program.
 
 use super::comprehension;
 use super::facts::{Facts, fitting};
@@ -13,38 +13,38 @@ use ratn_model::value::Value;
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
 
-/// The longest list that an expression may make.
+/// Limit of the length of a list.
 pub(super) const LONGEST_LIST: usize = 100_000;
 
-/// How what an expression is made of comes to be there.
+/// Whether the outputs in an expression exist.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Had {
-    /// It is made of no outputs.
+    /// It uses no outputs.
     Always,
     Written,
     Default,
     Nothing,
 }
 
-/// Where names get their values.
+/// The scope of expressions.
 #[derive(Clone)]
 pub(super) struct Place<'a> {
     pub(super) program: &'a Program,
     pub(super) facts: &'a Facts,
     pub(super) outputs: &'a BTreeMap<StateId, Outputs>,
     pub(super) regions: &'a BTreeMap<StateId, String>,
-    /// `$name`; the last of a name counts.
+    /// `$name`; the last one with a name counts.
     pub(super) variables: Vec<(String, Value)>,
     /// The outputs of the state itself.
     pub(super) own: Option<&'a Outputs>,
-    /// `$name`: the elements of the comprehensions around.
+    /// `$name`: the elements of the surrounding comprehensions.
     pub(super) elements: Vec<(String, Value)>,
-    /// `?name`: what a query around has found.
+    /// `?name`: the values found by the query around it.
     pub(super) row: Vec<(String, Value)>,
 }
 
 impl Place<'_> {
-    /// A fact with its arguments read.
+    /// A fact with its arguments evaluated.
     pub(super) fn pattern(&self, fact: &FactExpr) -> Result<FactPattern, Fail> {
         let mut arguments = Vec::new();
         for argument in &fact.arguments {
@@ -56,7 +56,7 @@ impl Place<'_> {
         Ok(FactPattern { predicate: fact.predicate.clone(), arguments })
     }
 
-    /// What an expression is made of, as far as the way here led through it.
+    /// Whether the outputs in an expression exist at this place.
     fn has(&self, expr: &Expr) -> Had {
         match expr {
             Expr::Call(Function::Either, ways) => self.way(ways).map_or(Had::Nothing, |way| self.has(way)),
@@ -81,7 +81,7 @@ impl Place<'_> {
                     }
                 });
                 for part in &within {
-                    // What is inside of another `either` is that one's.
+                    // Outputs inside of another `either` belong to that one.
                     let is_inner = within.iter().any(|around| {
                         let mut is_part = false;
                         let is_either = matches!(around, Expr::Call(Function::Either, _));
@@ -105,7 +105,7 @@ impl Place<'_> {
         }
     }
 
-    /// Which way an `either` takes. What needs no output is the end of the ways that are asked for.
+    /// The argument that `either` takes. Arguments behind one that needs no output are never considered.
     fn way<'e>(&self, ways: &'e [Expr]) -> Option<&'e Expr> {
         let asked = ways.iter().position(|way| self.has(way) == Had::Always).map_or(ways.len(), |end| end + 1);
         let first = |had: Had| ways[..asked].iter().find(|way| self.has(way) == had);
@@ -132,11 +132,10 @@ pub(super) fn term(value: &Value) -> Result<Term, Fail> {
     }
 }
 
-/// How the reference reads an expression.
+/// The reference's evaluation of an expression.
 pub(super) trait Read {
-    /// Its value.
     fn read(&self, place: &Place<'_>) -> Result<Value, Fail>;
-    /// Whether it is true; null is not.
+    /// Whether it is true; null is false.
     fn is_true(&self, place: &Place<'_>) -> Result<bool, Fail>;
 }
 
@@ -240,7 +239,7 @@ fn element(of: &Value, index: &Value) -> Result<Value, Fail> {
     }
 }
 
-/// Whether two values are the same; ints and floats are numbers.
+/// Whether two values are equal; ints and floats compare as numbers.
 pub(super) fn same(a: &Value, b: &Value) -> bool {
     match (a, b) {
         (Value::Int(i), Value::Float(x)) | (Value::Float(x), Value::Int(i)) => *i as f64 == *x,
@@ -252,7 +251,7 @@ pub(super) fn same(a: &Value, b: &Value) -> bool {
     }
 }
 
-/// Which of two numbers or texts is the smaller.
+/// The order of two numbers or two texts.
 pub(super) fn order(a: &Value, b: &Value) -> Result<Ordering, Fail> {
     match (a, b) {
         (Value::Int(i), Value::Int(j)) => Ok(i.cmp(j)),

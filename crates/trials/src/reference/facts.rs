@@ -1,13 +1,13 @@
-//! The facts that hold, in a map that is searched from end to end.
+//! The facts that hold, in a map that is always searched completely.
 
 use ratn_model::fact::{FactKey, FactPattern, Term};
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 
-/// What holds, in the order of keys.
+/// The facts that hold, in the order of keys.
 pub(super) type Facts = BTreeMap<FactKey, Value>;
 
-/// Whether a key has this predicate, as many arguments, and each of them that is given.
+/// Whether a key has the pattern's predicate, arity and given arguments.
 pub(super) fn fits(pattern: &FactPattern, key: &FactKey) -> bool {
     if pattern.predicate != key.predicate || pattern.arguments.len() != key.arguments.len() {
         return false;
@@ -22,7 +22,7 @@ pub(super) fn fits(pattern: &FactPattern, key: &FactKey) -> bool {
     true
 }
 
-/// The facts that fit, in the order of keys.
+/// The facts that match, in the order of keys.
 pub(super) fn fitting<'f>(
     facts: &'f Facts,
     pattern: &'f FactPattern,

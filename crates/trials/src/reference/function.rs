@@ -1,4 +1,4 @@
-//! The built-in functions but those that know a gripper.
+//! The built-in functions, except those with assumptions about a gripper.
 
 use super::Fail;
 use super::comprehension;
@@ -8,7 +8,6 @@ use ratn_model::pose::Pose;
 use ratn_model::value::Value;
 use std::cmp::Ordering;
 
-/// The value of a call.
 pub(super) fn call(function: Function, arguments: &[Value]) -> Result<Value, Fail> {
     match (function, arguments) {
         (Function::GraspPose | Function::PlacePose, _) => Err(Fail::NotMine("what knows a gripper")),
@@ -91,7 +90,7 @@ fn range(from: i64, to: i64) -> Result<Value, Fail> {
 
 fn best<'v>(mut items: impl Iterator<Item = &'v Value>, wanted: Ordering) -> Result<Value, Fail> {
     let Some(mut best) = items.next() else { return wrong("the best of nothing") };
-    // One alone has to have an order, too.
+    // A single value must have an order, too.
     order(best, best)?;
     for item in items {
         if order(item, best)? == wanted {

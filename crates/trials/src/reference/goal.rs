@@ -1,7 +1,7 @@
-//! One action: its tries, what it answers, and what its end changes.
+//! One action: its tries, its answer, and its effects.
 //!
-//! What ends without an answer (a goal that had no time left, a worker that died too often, a precondition that does not hold) ends
-//! `aborted` and changes nothing, not even by the effects of `aborted`: it is not known how far it came.
+//! An action without an answer (timeout, too many crashes, a precondition that does not hold) ends `aborted` and changes nothing,
+//! not even by the effects of `aborted`, because it is not known how far it came.
 
 use super::evaluate::{Place, Read};
 use super::walk::assign;
@@ -16,20 +16,20 @@ use ratn_model::value::{Type, Value};
 use ratn_simulation::run::{Answer, Performance, Trigger};
 use ratn_world::world::World;
 
-/// So often a computing or sensing action is tried whose worker dies, unless it says otherwise.
+/// Number of attempts of a computing or sensing action whose worker dies, unless it declares another.
 const ATTEMPTS: u32 = 3;
 
-/// How a goal answered.
+/// The end of a goal.
 struct Ended {
     outcome: String,
     outputs: Outputs,
     measured: Vec<(FactKey, Value)>,
-    /// Whether anything was done at all; else nothing is changed, whatever the outcome declares.
+    /// Whether the goal began; if not, nothing is changed, whatever the outcome declares.
     has_begun: bool,
 }
 
 impl Reference<'_> {
-    /// Visits an action; its outcome.
+    /// Visits an action; returns its outcome.
     pub(super) fn action(
         &mut self,
         state: &State,
@@ -45,7 +45,7 @@ impl Reference<'_> {
         };
         let assigned = self.answered(state, &mut ended, variables)?;
         let Ended { outcome, outputs, measured, has_begun } = ended;
-        // Both modes log the outcome before they make the effects; that an effect has no value makes it `aborted` all the same.
+        // Both modes log the outcome before they apply the effects; if an effect has no value, the action still ends `aborted`.
         self.tell(path, in_routine, &outcome, (inputs, outputs.clone()));
         let made = match has_begun {
             true => self.effects_of(state, &outcome, &outputs, &measured, variables),
@@ -65,7 +65,7 @@ impl Reference<'_> {
         Ok(outcome)
     }
 
-    /// Notes a result as the story of a run does: nothing of what is in a routine, and not why something failed.
+    /// Notes a result as in the story of a run: nothing inside of routines, and no reasons of failures.
     pub(super) fn tell(&mut self, path: &str, in_routine: bool, outcome: &str, ports: (Outputs, Outputs)) {
         if !in_routine {
             let result = Real::new(outcome.to_owned(), is_good(outcome).then_some(ports));
@@ -73,7 +73,7 @@ impl Reference<'_> {
         }
     }
 
-    /// Tries until there is an answer that counts.
+    /// Tries until an answer counts.
     fn tries(
         &mut self,
         state: &State,
@@ -86,7 +86,7 @@ impl Reference<'_> {
         let annotations = &state.annotations;
         loop {
             self.meets(state, &variables.to_vec())?;
-            // It waits for what it asks for, be it refused, and for what it sees.
+            // The action may be waiting for resources, even refused ones, or for its projection.
             self.may_be_cut()?;
             if !in_routine {
                 self.asks(state, variables)?;
@@ -136,14 +136,14 @@ impl Reference<'_> {
         }
     }
 
-    /// What a state says of being cut short is true, where it has a value and is allowed.
+    /// Applies a state's effects for `preempted`, if they can be evaluated and are allowed.
     pub(super) fn say_cut_short(&mut self, state: &State, variables: &[(String, Value)]) {
         let Some(declared) = state.annotations.effects.get(PREEMPTED) else { return };
         let changes = effects::bound(declared, &self.place(variables, Some(&Outputs::new())));
         self.races.has_failed |= changes.and_then(|changes| self.change(changes)).is_err();
     }
 
-    /// Whether something does not hold that has to while it goes on.
+    /// Whether a `while` condition does not hold.
     fn is_violated(&self, state: &State, variables: &[(String, Value)]) -> Result<bool, Fail> {
         for holds in &state.annotations.holds {
             if !holds.is_true(&self.place(variables, None))? {
@@ -153,7 +153,7 @@ impl Reference<'_> {
         Ok(false)
     }
 
-    /// One goal.
+    /// Performs one goal.
     fn perform(
         &mut self,
         state: &State,
@@ -169,7 +169,7 @@ impl Reference<'_> {
         let mut inputs = Outputs::new();
         for (port, value) in ports {
             match value.read(&place)? {
-                // An optional port that is not given.
+                // A missing optional input.
                 Value::Null => {}
                 value => drop(inputs.insert(port.clone(), value)),
             }
@@ -192,14 +192,14 @@ impl Reference<'_> {
         if state.annotations.nature == Nature::Irreversible {
             self.result.acts.push((path.to_owned(), goal_text(&goal)));
         }
-        // A world only because the oracle wants one.
+        // The oracle's interface needs a `World`.
         let world = World::from_facts(facts, Revision(0));
         let performance = self.oracle.perform(path, attempt, &goal, &world);
         self.come_from_outside(path);
         Ok((goal, performance))
     }
 
-    /// What changes from outside when a goal of this path starts.
+    /// Applies the changes from outside that are due when a goal of this path starts.
     fn come_from_outside(&mut self, path: &str) {
         let (now, later) = std::mem::take(&mut self.outside)
             .into_iter()
@@ -213,7 +213,7 @@ impl Reference<'_> {
         }
     }
 
-    /// An answer that does not fit its action is a failure; what the state assigns.
+    /// Checks the answer against the action (a wrong one is a failure); returns what the state assigns.
     fn answered(
         &self,
         state: &State,
@@ -276,7 +276,7 @@ fn is_good(outcome: &str) -> bool {
     !matches!(outcome, ABORTED | PREEMPTED | VIOLATED)
 }
 
-/// The declared estimate, where it is one.
+/// The declared estimate, if it is valid.
 fn estimate_s(state: &State, place: &Place<'_>) -> Option<f64> {
     let seconds = match state.annotations.duration_s.as_ref()?.read(place).ok()? {
         Value::Int(i) => i as f64,
@@ -286,7 +286,7 @@ fn estimate_s(state: &State, place: &Place<'_>) -> Option<f64> {
     (seconds.is_finite() && seconds >= 0.0).then_some(seconds)
 }
 
-/// What changes resources is potentially irreversible, whatever it says.
+/// A state that operates on resources is potentially irreversible, whatever it declares.
 fn is_irreversible(state: &State) -> bool {
     state.annotations.nature == Nature::Irreversible || operates_resources(state)
 }
@@ -296,7 +296,7 @@ fn operates_resources(state: &State) -> bool {
     state.annotations.resources.iter().any(|line| changes(line.operation))
 }
 
-/// The seed of a try: FNV-1a over the run's seed, the path and, from the second on, the number of the try.
+/// The seed of a try: FNV-1a over the run's seed, the path and, from the second try on, the number of the try.
 fn seed(run: u64, path: &str, tries: u32) -> u64 {
     let mut bytes = run.to_le_bytes().to_vec();
     bytes.extend(path.bytes());

@@ -1,24 +1,23 @@
-//! The reference: a second, slow and plain evaluation of a task program, one state after the other, as docs/task-files.md says it.
+//! The reference: a second, slow and simple evaluation of a task program, one state after the other, as docs/task-files.md describes it.
 //!
-//! Both modes are compared with it, so a mistake that they share is found, too. It shares no behaviour with them: expressions, facts,
-//! patterns, queries, effects, bindings, transitions, loops, retries and resource sums are read and counted here once more,
-//! without an index and without cleverness. What it does share:
+//! Both modes are compared with it, so that a mistake common to both is found, too. It shares no behaviour with them: expressions, facts, patterns, queries,
+//! effects, bindings, transitions, loops, retries and resource sums are implemented here independently, without an index and as simply as possible. It does
+//! share:
 //!
-//! - the plain data of `ratn-model` (`Program`, `State`, `Expr`, `Value`, `FactKey`, `Change`), the arithmetic of poses
-//!   and what an ontology says of one change;
-//! - the [`Oracle`], which is the environment. It wants a `World`, so one is built from the facts only to be handed to it.
+//! - the plain data of `ratn-model` (`Program`, `State`, `Expr`, `Value`, `FactKey`, `Change`), the arithmetic of poses, and the ontology's check of a single
+//!   change;
+//! - the [`Oracle`], which is the environment. Its interface needs a `World`, so one is built from the facts for that purpose.
 //!
-//! There is no clock. A goal that takes longer than its timeout is one that has aborted; regions run one after another,
-//! which is the same because they touch nothing of each other. What depends on time otherwise than a race of regions that touch nothing of
-//! each other does (deadlines, races for the same), or on a wait without an end (resources that are never there) is [`Fail::NotMine`]: there is no verdict. What is refused, it is told
-//! by the paths of the states.
+//! There is no clock. A goal that takes longer than its timeout counts as aborted. Regions run one after another, which is equivalent because they share
+//! nothing. Other dependence on time (deadlines, races for the same facts or resources) and endless waits (for resources that never exist) give
+//! [`Fail::NotMine`]: there is no verdict. Only races of regions that share nothing are evaluated. Refusals are given to it by the paths of the states.
 //!
 //! | | |
 //! |---|---|
 //! | facts and effects | `facts`, `effects` |
 //! | expressions | `evaluate`, `function`, `query` |
-//! | what is known of a run's log alone | `preconditions` |
-//! | what runs | `walk` (states that contain others), `race` (what ends before all that is in it has), `goal` (one action), `waits` (a state that waits), `shown` (what its provider sees), `resources` |
+//! | checks that need only a run's log | `preconditions` |
+//! | execution | `walk` (composite states), `race` (preemptive concurrencies, timeouts, watches), `goal` (one action), `waits`, `shown` (what a provider sees), `resources` |
 
 mod compare;
 mod comprehension;
@@ -57,51 +56,51 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Output ports of one state.
 type Outputs = BTreeMap<String, Value>;
 
-/// No run of the reference has more visits and iterations.
+/// Limit of visits and iterations in one evaluation.
 const MAX_STEPS: usize = 50_000;
 
-/// Why something has no value, or did not happen.
+/// Why something has no value, or was not executed.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Fail {
-    /// It needs what was never written.
+    /// It needs an output that was never written.
     Unwritten(String),
     /// It can have no value here.
     Wrong(String),
     /// The reference does not evaluate this: there is no verdict on the program.
     NotMine(&'static str),
-    /// What is under way is cut short: the run was told to end here, or a race was decided.
+    /// The present action is cut short: the run was told to end here, or a race was decided.
     Cut,
 }
 
-/// What should become of a program.
+/// The expected result of a program.
 #[derive(Debug, Default, Clone, PartialEq)]
 pub(super) struct ReferenceResult {
     pub(super) outcome: String,
     pub(super) outputs: Outputs,
     pub(super) facts: Facts,
-    /// Thousandths of task resources that are left, by kind.
+    /// Remaining task resources in thousandths, by kind.
     pub(super) units: BTreeMap<String, u64>,
     /// The goals of PIAs in one order that the program allows: path, and seed with inputs.
     pub(super) acts: Vec<(String, String)>,
-    /// How actions that are in no routine ended, by path.
+    /// Results of actions outside of routines, by path.
     pub(super) results: BTreeMap<String, Vec<Real>>,
-    /// What was changed, by predicate, or by fact where there are regions.
+    /// The changes, by predicate, or by fact if there are regions.
     pub(super) changes: BTreeMap<String, Vec<Change>>,
 }
 
-/// What a program is evaluated with.
+/// The input of an evaluation.
 pub(super) struct Given<'a> {
     pub(super) program: &'a Program,
     pub(super) seed: u64,
     pub(super) parameters: BTreeMap<String, Value>,
     pub(super) facts: Facts,
-    /// Thousandths of the task resources that there are, by kind.
+    /// Task resources at the start in thousandths, by kind.
     pub(super) units: BTreeMap<String, u64>,
-    /// States that are refused whatever they ask for, by their paths without visits.
+    /// States whose acquires are always refused, by their paths without visits.
     pub(super) refused: BTreeSet<String>,
-    /// What changes from outside when a goal starts.
+    /// Changes from outside when a goal starts.
     pub(super) outside: Vec<(Trigger, Event)>,
-    /// What is sent before the run begins, the oldest first.
+    /// Signals sent before the run begins, the oldest first.
     pub(super) signals: Vec<(String, Value)>,
     pub(super) oracle: &'a mut dyn Oracle,
 }
@@ -113,28 +112,27 @@ struct Reference<'a> {
     oracle: &'a mut dyn Oracle,
     refused: BTreeSet<String>,
     outside: Vec<(Trigger, Event)>,
-    /// Signals that nobody has waited for yet, the oldest first.
+    /// Signals that no wait has taken, the oldest first.
     signals: Vec<(String, Value)>,
-    /// Of all states, what their latest visits wrote.
+    /// The outputs of the latest visit of each state.
     outputs: BTreeMap<StateId, Outputs>,
-    /// How regions ended.
+    /// Outcomes of regions.
     regions: BTreeMap<StateId, String>,
     steps: usize,
-    /// Whether the run is told to end at the places where an action waits or is under way, as they come in each region.
+    /// Decides at each place where an action waits or runs, region by region, whether the run is told to end there.
     choices: Option<Choices>,
-    /// What the environment was about to change when a wait for it was cut short: it may come at any moment of the way out, or never.
+    /// Changes by the environment that a cut wait was waiting for: they may come at any moment of the way out, or never.
     coming: Vec<(FactKey, Option<Value>)>,
-    /// This thread of control is on its way out.
+    /// Whether this thread of control is on its way out.
     is_leaving: bool,
-    /// What was cut short had not been entered.
+    /// Whether the state that was cut short had not been entered yet.
     is_outside: bool,
-    /// What this thread of control is in.
+    /// The races around this thread of control.
     races: Races,
     result: ReferenceResult,
 }
 
-/// Where a run is told to end: of the places where it could be, one after another, whether it is. A region that is not told at the first is
-/// at a later one, or has ended.
+/// Where a run is told to end: one decision for each place where it could be. A region that is not told at one place is told at a later one, or has ended.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Choices {
     made: Vec<bool>,
@@ -142,7 +140,7 @@ pub(super) struct Choices {
 }
 
 impl Choices {
-    /// The next of all; none after the last.
+    /// The next sequence of decisions; `None` after the last.
     pub(super) fn next(mut self) -> Option<Choices> {
         while self.made.pop()? {}
         self.made.push(true);
@@ -158,8 +156,8 @@ impl Choices {
     }
 }
 
-/// Evaluates a program up to where the run is told to end, and what is done on the way out; with the choices as far as they were needed. `None`
-/// where it is not told to.
+/// Evaluates a program up to the place where the run is told to end, and its way out; returns the decisions that were needed, too. The result is `None` if it
+/// is not told to end.
 ///
 /// # Errors
 /// [`Fail::NotMine`].
@@ -194,7 +192,7 @@ pub(super) fn evaluate(given: Given<'_>) -> Result<ReferenceResult, Fail> {
 }
 
 impl<'a> Reference<'a> {
-    /// At the start of a program, with the variables in sight.
+    /// The reference at the start of a program, with the variables in scope.
     fn of(given: Given<'a>) -> (Reference<'a>, Vec<(String, Value)>) {
         let Given { program, seed, parameters, facts, units, refused, outside, signals, oracle } = given;
         let reference = Reference {
@@ -225,7 +223,7 @@ impl Reference<'_> {
         if is_cut { Err(self.cut_by_the_run()) } else { Ok(()) }
     }
 
-    /// A moment at which what was waited for may come, though nobody waits for it any more.
+    /// A moment at which a change may come that was waited for before.
     fn may_come(&mut self) {
         if !self.coming.is_empty() && self.choices.as_mut().is_some_and(Choices::choose) {
             for (key, value) in std::mem::take(&mut self.coming) {
@@ -234,7 +232,7 @@ impl Reference<'_> {
         }
     }
 
-    /// The environment makes a fact so.
+    /// The environment sets or removes a fact.
     fn becomes(&mut self, key: FactKey, value: Option<Value>) {
         match value {
             Some(value) => drop(self.result.facts.insert(key, value)),
@@ -271,7 +269,7 @@ impl Reference<'_> {
         Ok(outcome)
     }
 
-    /// Where names get their values now.
+    /// The present scope.
     fn place<'p>(&'p self, variables: &[(String, Value)], own: Option<&'p Outputs>) -> Place<'p> {
         Place {
             program: self.program,
@@ -285,7 +283,7 @@ impl Reference<'_> {
         }
     }
 
-    /// Changes happen, all of them or none.
+    /// Applies changes, all of them or none.
     fn change(&mut self, changes: Vec<Change>) -> Result<(), Fail> {
         self.result.facts = effects::applied(&self.result.facts, &changes, self.program.ontology.as_ref())?;
         for change in changes {
@@ -296,7 +294,7 @@ impl Reference<'_> {
     }
 }
 
-/// A failure of the program is a result; what the reference does not evaluate ends the evaluation.
+/// Separates failures of the program, which are results, from reasons to end the evaluation.
 fn fails<T>(result: Result<T, Fail>) -> Result<Result<T, Fail>, Fail> {
     match result {
         Err(Fail::NotMine(what)) => Err(Fail::NotMine(what)),

@@ -1,4 +1,4 @@
-//! Whether every motion of a run began with its preconditions true, on facts followed through the log.
+//! Checks that the preconditions of every motion of a run were true when it began, with the facts followed through the log.
 
 use super::Fail;
 use super::effects;
@@ -12,8 +12,8 @@ use ratn_model::value::Value;
 use ratn_simulation::run::Run;
 use std::collections::BTreeMap;
 
-/// The first motion that began although a precondition did not hold. Variables are known from the inputs; a precondition that needs
-/// more than facts and those is left out.
+/// The first motion that began although a precondition did not hold. Values of variables are taken from the inputs; preconditions
+/// that need more than these and facts are skipped.
 pub(in super::super) fn unmet(program: &Program, run: &Run) -> Option<String> {
     let mut facts = Facts::new();
     let mut states: BTreeMap<InstanceId, StateId> = BTreeMap::new();

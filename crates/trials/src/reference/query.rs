@@ -1,7 +1,7 @@
-//! Queries: whether there are values for `?name` that make all conditions true, by trying every fact for every condition.
+//! Queries: finds values for `?name` that make all conditions true, by trying every fact for every condition.
 //!
-//! The next condition is the first that can be tried with what has been found: tests as early as they can be, then facts, and at
-//! last `?v = expression`, which gives a value only where nothing else does.
+//! The next condition is the first one that can be tried with the values found so far: tests as early as possible, then facts,
+//! and last `?v = expression`, which binds only if nothing else does.
 
 use super::Fail;
 use super::evaluate::{Place, Read, same, term, wrong};
@@ -10,15 +10,15 @@ use ratn_model::expression::{BinaryOperator, Expr, FactExpr, Function, UnaryOper
 use ratn_model::fact::{FactPattern, Term};
 use ratn_model::value::Value;
 
-/// One condition; facts that a test needs stand by themselves.
+/// One condition; facts that a test needs are separate conditions.
 enum Condition {
     Fact(FactExpr, Says),
     Test(Expr),
-    /// There is an answer to these, or there is none.
+    /// There is an answer to these (true), or there is none (false).
     Answers(Vec<Condition>, bool),
 }
 
-/// What a fact has to say.
+/// The required value of a fact.
 enum Says {
     Anything,
     /// Neither false nor null.
@@ -26,7 +26,6 @@ enum Says {
     Value(Expr),
 }
 
-/// Whether a query has an answer.
 pub(super) fn has_answer(query: &[Expr], place: &Place<'_>) -> Result<bool, Fail> {
     let mut hidden = place.row.len();
     let conditions = conditions(query, &mut hidden);
@@ -34,7 +33,7 @@ pub(super) fn has_answer(query: &[Expr], place: &Place<'_>) -> Result<bool, Fail
     answers(&all, &mut place.clone(), &mut |_| true)
 }
 
-/// What the answers say of some variables, each once; in the order of all values, which is the model's.
+/// The values of some variables in the answers, without duplicates, in the total order of values of the model.
 pub(super) fn found_values(wanted: &[String], query: &[Expr], place: &Place<'_>) -> Result<Vec<Value>, Fail> {
     let mut hidden = place.row.len();
     let conditions = conditions(query, &mut hidden);
@@ -55,7 +54,7 @@ pub(super) fn found_values(wanted: &[String], query: &[Expr], place: &Place<'_>)
     Ok(values)
 }
 
-/// Whether an answer is enough.
+/// Returns whether to stop after an answer.
 type Enough<'a> = dyn FnMut(&Place<'_>) -> bool + 'a;
 
 fn conditions(query: &[Expr], hidden: &mut usize) -> Vec<Condition> {
@@ -94,7 +93,7 @@ fn add_fact(fact: &FactExpr, says: Says, hidden: &mut usize, all: &mut Vec<Condi
     all.push(Condition::Fact(FactExpr { predicate: fact.predicate.clone(), arguments }, says));
 }
 
-/// The expression with a variable for each fact that has to be there for it to be true.
+/// Replaces each fact that must hold for the expression to be true by a variable.
 fn without_facts(expr: &Expr, hidden: &mut usize, all: &mut Vec<Condition>) -> Expr {
     let mut within = |of: &Expr| Box::new(without_facts(of, hidden, all));
     match expr {
@@ -122,7 +121,7 @@ fn without_facts(expr: &Expr, hidden: &mut usize, all: &mut Vec<Condition>) -> E
     }
 }
 
-/// Whether there are values that make all of these true, and that are enough.
+/// Tries all values that make these conditions true, until `enough` returns true.
 fn answers(conditions: &[&Condition], place: &mut Place<'_>, enough: &mut Enough<'_>) -> Result<bool, Fail> {
     if conditions.is_empty() {
         return Ok(enough(place));
@@ -130,7 +129,7 @@ fn answers(conditions: &[&Condition], place: &mut Place<'_>, enough: &mut Enough
     let others = |at: usize| conditions.iter().enumerate().filter(move |(n, _)| *n != at).map(|(_, other)| *other);
     let rest = |at: usize| others(at).collect::<Vec<&Condition>>();
     for (at, condition) in conditions.iter().enumerate() {
-        // A variable that stands nowhere else is any.
+        // A variable that occurs nowhere else may have any value.
         let is_bound = |name: &String| is_known(name, place) || !others(at).any(|other| names_in(other).contains(name));
         let holds = match condition {
             Condition::Answers(inner, wanted) if names_in(condition).iter().all(is_bound) => {
@@ -166,7 +165,7 @@ fn answers(conditions: &[&Condition], place: &mut Place<'_>, enough: &mut Enough
     wrong("a variable of the query gets no value")
 }
 
-/// Tries every fact that fits.
+/// Tries every fact that matches.
 fn found(
     fact: &FactExpr,
     pattern: &Option<FactPattern>,
@@ -204,7 +203,7 @@ fn found(
     Ok(false)
 }
 
-/// The variable has this value, or gets it.
+/// Binds the variable, or compares it if bound.
 fn unify(name: &str, value: Value, place: &mut Place<'_>) -> bool {
     match place.row.iter().rev().find(|(known, _)| known == name) {
         Some((_, known)) => same(known, &value),
@@ -215,7 +214,7 @@ fn unify(name: &str, value: Value, place: &mut Place<'_>) -> bool {
     }
 }
 
-/// The facts to try, where that is known; `Some(None)`: there is no such fact, because a variable is no argument.
+/// The pattern of the facts to try; `Some(None)`: no fact can match, because a variable's value is no argument.
 fn pattern(fact: &FactExpr, place: &Place<'_>) -> Result<Option<Option<FactPattern>>, Fail> {
     let mut arguments = Vec::new();
     for argument in &fact.arguments {
@@ -237,7 +236,7 @@ fn is_known(name: &String, place: &Place<'_>) -> bool {
     place.row.iter().any(|(known, _)| known == name)
 }
 
-/// Whether every `?name` in it is known, but for those of queries within.
+/// Whether every `?name` in it is bound, except those of inner queries.
 fn is_readable(expr: &Expr, place: &Place<'_>) -> bool {
     let mut all = Vec::new();
     expr.visit(&mut |part| {

@@ -1,11 +1,10 @@
-//! A concurrency that ends before all of its regions have, and a state with a limit or a watch, which is one.
+//! Preemptive concurrencies, and states with a timeout or a `while` condition, which become such concurrencies.
 //!
-//! The only clock of the reference is here: actions take what the environment says, everything else takes no time. Of a race, each region is
-//! evaluated by itself to find out when it would end, which says when the race is decided; then once more, up to that moment. What is
-//! under way in a region then is cut short, and the region leaves the states in which it is.
+//! This is the only clock of the reference: actions take the durations of the oracle, everything else takes no time. In a race, each region
+//! is first evaluated alone to find its end, which gives the moment when the race is decided; then all are evaluated again up to that
+//! moment. The present action of each remaining region is then cut short, and the region leaves its states.
 //!
-//! There is no verdict where regions touch what another one does, and where two ends are so close to each other that it matters what
-//! everything else takes.
+//! There is no verdict if regions share anything, or if two ends are so close that the durations of everything else matter.
 
 use super::evaluate::Read;
 use super::{Fail, Reference, fails};
@@ -17,28 +16,28 @@ use ratn_model::value::Value;
 use ratn_model::wait::Wait;
 use std::collections::BTreeSet;
 
-/// All that takes no time here takes less, together.
+/// Upper limit of all durations, together, that count as no time here.
 const CLOSE_S: f64 = 400.0;
 
 type Variables = Vec<(String, Value)>;
 
-/// What must hold, with the variables that it sees.
+/// Conditions that must hold, with the variables in their scope.
 type Watch = (Vec<Expr>, Variables);
 
-/// The races that a thread of control is in, and what became of it there.
+/// The races around a thread of control, and what has happened in them.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Races {
-    /// The seconds since the outermost began.
+    /// Seconds since the outermost race began.
     now_s: f64,
-    /// It may be so much later: regions inside of one node take turns with what they block, and who is first is not known here.
+    /// Possible delay: regions inside of one node take turns with blocked resources, and their order is not known here.
     late_s: f64,
-    /// When one is decided, and its number; the outermost has the first.
+    /// When the first of them is decided, and its number; the outermost is 0.
     until: Option<(f64, usize)>,
-    /// Of every race.
+    /// The watch of every race.
     watches: Vec<Option<Watch>>,
-    /// What cut it short.
+    /// The race that cut this thread short.
     cut: Option<Cut>,
-    /// Something failed on its way out.
+    /// Whether something failed on the way out.
     pub(super) has_failed: bool,
 }
 
@@ -47,26 +46,26 @@ impl Races {
         self.now_s + self.late_s
     }
 
-    /// What was done on the way out took its time, and nothing else of it counts.
+    /// Continues after a `finally`: its duration counts, nothing else of it.
     pub(super) fn resume(&mut self, cut: Races) {
         *self = Races { now_s: self.now_s, late_s: self.late_s, ..cut };
     }
 }
 
-/// The regions of a concurrency that waits for all of them, one after another.
+/// The regions of a concurrency that waits for all of them, evaluated one after another.
 pub(super) struct Beside {
     races: Races,
     is_leaving: bool,
     end_s: f64,
     late_s: f64,
-    /// What all regions take, one after the other.
+    /// The durations of all regions added up.
     together_s: f64,
     has_failed: bool,
     cut: Option<Option<Cut>>,
 }
 
 impl Beside {
-    /// A region begins.
+    /// Begins the next region.
     pub(super) fn begin(&mut self, reference: &mut Reference<'_>) {
         self.end_s = self.end_s.max(reference.races.now_s);
         self.late_s = self.late_s.max(reference.races.late_s);
@@ -74,10 +73,10 @@ impl Beside {
         (reference.races, reference.is_leaving) = (self.races.clone(), self.is_leaving);
     }
 
-    /// A region was cut short.
+    /// Notes that a region was cut short.
     pub(super) fn is_cut(&mut self, reference: &mut Reference<'_>, regions: usize) -> Result<(), Fail> {
         if regions > 1 && reference.races.cut.is_some_and(|cut| cut.watch.is_some()) {
-            // Where the others are then is not known here.
+            // Where the other regions are at that moment is not known here.
             return Err(Fail::NotMine("regions that are watched"));
         }
         self.has_failed |= reference.races.has_failed;
@@ -85,7 +84,7 @@ impl Beside {
         Ok(())
     }
 
-    /// All of them have ended.
+    /// Ends the concurrency.
     pub(super) fn end(mut self, reference: &mut Reference<'_>, regions: &[StateId]) -> Result<(), Fail> {
         self.begin(reference);
         (reference.races.now_s, reference.races.late_s) = (self.end_s, self.late_s);
@@ -98,7 +97,7 @@ impl Beside {
             reference.races.late_s = latest_s - self.end_s;
         }
         if self.cut.is_none() && regions.len() > 1 && reference.is_broken() {
-            // What made a condition false may have been done while another region went on.
+            // A condition may have become false while another region was running.
             return Err(Fail::NotMine("regions that are watched"));
         }
         let Some(cut) = self.cut else { return Ok(()) };
@@ -107,26 +106,26 @@ impl Beside {
     }
 }
 
-/// A race that was decided while something went on.
+/// A race that was decided while an action was running.
 #[derive(Debug, Clone, Copy)]
 struct Cut {
     race: usize,
-    /// How its watch ended, if that decided it.
+    /// The outcome of its watch, if the watch decided it.
     watch: Option<&'static str>,
 }
 
-/// One evaluation of a region.
+/// The result of evaluating a region.
 struct Region {
     outcome: String,
     end_s: f64,
     late_s: f64,
-    /// What cut it short; `Some(None)` where the run was told to end.
+    /// The race that cut it short; `Some(None)` if the run was told to end.
     cut: Option<Option<Cut>>,
     has_failed: bool,
 }
 
 impl Reference<'_> {
-    /// Nothing begins inside of a watched state whose condition does not hold any more.
+    /// Cuts the thread short if a watch around it is broken, before anything begins.
     pub(super) fn is_watched(&mut self) -> Result<(), Fail> {
         if self.is_leaving {
             return Ok(());
@@ -140,12 +139,12 @@ impl Reference<'_> {
         Ok(())
     }
 
-    /// Whether a condition of what is around does not hold any more.
+    /// Whether a watch around the thread is broken.
     fn is_broken(&self) -> bool {
         !self.is_leaving && self.races.watches.iter().flatten().any(|watch| self.broken(watch) != Ok(None))
     }
 
-    /// Something goes on for so long.
+    /// An action runs for this duration.
     pub(super) fn takes(&mut self, seconds: f64) -> Result<(), Fail> {
         self.is_watched()?;
         if self.races.watches.is_empty() {
@@ -169,13 +168,13 @@ impl Reference<'_> {
         Ok(())
     }
 
-    /// The regions of a concurrency begin here.
+    /// Begins the regions of a concurrency.
     pub(super) fn beside(&self) -> Beside {
         let (races, is_leaving, end_s) = (self.races.clone(), self.is_leaving, self.races.now_s);
         Beside { races, is_leaving, end_s, late_s: 0.0, together_s: 0.0, has_failed: false, cut: None }
     }
 
-    /// What is under way is cut short because the run is told to end.
+    /// Cuts the present action short because the run is told to end.
     pub(super) fn cut_by_the_run(&mut self) -> Fail {
         self.cut(None)
     }
@@ -186,12 +185,12 @@ impl Reference<'_> {
         Fail::Cut
     }
 
-    /// Whether a race cut short what is left.
+    /// Whether the thread leaves its states because of a race.
     pub(super) fn has_lost(&self) -> bool {
         self.is_leaving && self.races.cut.is_some()
     }
 
-    /// By which outcome a watch ends, if something does not hold.
+    /// The outcome with which a watch ends, if it is broken.
     fn broken(&self, (holds, variables): &Watch) -> Result<Option<&'static str>, Fail> {
         for holds in holds {
             match fails(holds.is_true(&self.place(variables, None)))? {
@@ -203,7 +202,7 @@ impl Reference<'_> {
         Ok(None)
     }
 
-    /// A preemptive concurrency; its outcome, or none where it is violated before anything in it begins.
+    /// A preemptive concurrency; returns its outcome, or `None` if it is violated before anything in it begins.
     pub(super) fn race(
         &mut self,
         state: &State,
@@ -222,7 +221,7 @@ impl Reference<'_> {
         }
     }
 
-    /// A state with a limit, a watch or both.
+    /// A state with a timeout, a watch or both.
     fn limited(
         &mut self,
         state: &State,
@@ -275,7 +274,7 @@ impl Reference<'_> {
         Ok(Some(outcome))
     }
 
-    /// Regions of which the first that ends ends the others, or as soon as enough have succeeded.
+    /// Regions of which the first to end decides the race, or the required number of successes.
     fn first_of(
         &mut self,
         state: &State,
@@ -295,7 +294,7 @@ impl Reference<'_> {
         let number = self.races.watches.len();
         let (outer, is_leaving) = (self.races.clone(), self.is_leaving);
         let by_itself = within(&outer, is_leaving, None, None);
-        // How each would end by itself, in the order of their ends.
+        // The ends of the regions evaluated alone, in the order of time.
         let mut ends: Vec<(f64, usize, String)> = Vec::new();
         for (place, region) in regions.iter().enumerate() {
             let before = (self.result.clone(), self.outputs.clone(), self.regions.clone());
@@ -329,7 +328,7 @@ impl Reference<'_> {
         if others.map(|(at_s, ..)| *at_s).chain(outer.until.map(|(at_s, _)| at_s)).any(is_close) {
             return Err(Fail::NotMine("ends that are close to each other"));
         }
-        // The same again, up to there.
+        // All regions again, up to the decision.
         let before = variables.clone();
         let mut all = Vec::new();
         for (place, region) in regions.iter().enumerate() {
@@ -361,7 +360,7 @@ impl Reference<'_> {
         self.regions.extend(regions.iter().map(|region| (*region, outcome(*region).to_owned())));
     }
 
-    /// A region, as far as it comes within these races.
+    /// Evaluates a region within these races.
     fn region(
         &mut self,
         region: StateId,
@@ -381,7 +380,7 @@ impl Reference<'_> {
         Ok(Region { outcome, end_s, late_s, cut, has_failed: self.races.has_failed })
     }
 
-    /// All regions have ended.
+    /// Ends a race after all its regions.
     fn after(&mut self, outer: Races, is_leaving: bool, regions: &[Region]) -> Result<(), Fail> {
         let end_s = regions.iter().fold(outer.now_s, |latest, region| latest.max(region.end_s));
         let number = outer.watches.len();
@@ -396,7 +395,7 @@ impl Reference<'_> {
         if regions.len() == 1 && !regions.iter().any(is_inner) {
             return Ok(());
         }
-        // What is around may be decided, or broken, while this is on its way out.
+        // A race around may be decided, or a watch broken, during the way out.
         let is_late = !is_leaving && self.races.until.is_some_and(|(until_s, _)| end_s + late_s + CLOSE_S > until_s);
         if is_late || self.is_broken() {
             return Err(Fail::NotMine("a race that is cut short on its way out"));
@@ -404,8 +403,8 @@ impl Reference<'_> {
         Ok(())
     }
 
-    /// Whether a region writes what another one reads or writes, or works with a kind of resource that another one works with: under the one
-    /// lease of the race they may have to take turns.
+    /// Whether a region writes what another one reads or writes, or uses a kind of resource that another one uses: under the single lease of
+    /// the race they might have to take turns.
     fn touch(&self, regions: &[StateId]) -> bool {
         let touched: Vec<Touched> = regions.iter().map(|region| self.touched(*region)).collect();
         touched.iter().enumerate().any(|(place, one)| {
@@ -419,7 +418,7 @@ impl Reference<'_> {
         })
     }
 
-    /// Whether two of these regions of one node block the same: the node has as much of it as the most that one of them blocks.
+    /// Whether two of these regions of one node block the same kind: the node holds only the maximum of what its regions block.
     fn take_turns(&self, regions: &[StateId]) -> bool {
         let touched: Vec<Touched> = regions.iter().map(|region| self.touched(*region)).collect();
         let mut pairs =
@@ -447,7 +446,7 @@ impl Reference<'_> {
                 }
                 (_, None) => touched.reads_any |= !state.is_pause(),
             }
-            // What it measures is said nowhere.
+            // Measured facts are not declared anywhere.
             let mut outcomes = state.outcomes.iter().map(String::as_str).chain([SUCCESS]);
             let is_said = |outcome: &str| annotations.effects.contains_key(outcome);
             touched.writes_any |= annotations.nature != Nature::Computes && !outcomes.all(is_said);
@@ -456,7 +455,7 @@ impl Reference<'_> {
     }
 }
 
-/// What a region touches.
+/// The facts and resources that a region uses.
 #[derive(Default)]
 struct Touched {
     reads: BTreeSet<String>,
@@ -477,7 +476,7 @@ fn written(effects: &[EffectExpr], predicates: &mut BTreeSet<String>) {
     }
 }
 
-/// The races inside of one; on the way out, what is around cuts nothing short any more.
+/// The races inside of a new one; on the way out, the outer ones have no effect any more.
 fn within(outer: &Races, is_leaving: bool, until: Option<(f64, usize)>, watch: Option<Watch>) -> Races {
     let mut watches = if is_leaving { vec![None; outer.watches.len()] } else { outer.watches.clone() };
     watches.push(watch);
@@ -489,7 +488,7 @@ fn within(outer: &Races, is_leaving: bool, until: Option<(f64, usize)>, watch: O
     Races { now_s: outer.now_s, late_s: outer.late_s, until, watches, cut: None, has_failed: false }
 }
 
-/// What a region assigned is seen outside.
+/// Takes over a region's assignments to outer variables.
 pub(super) fn merge(variables: &mut Variables, before: &Variables, own: Variables) {
     for (number, variable) in own.into_iter().enumerate().take(before.len()) {
         if variable.1 != before[number].1 {

@@ -1,4 +1,4 @@
-//! Task resources, counted as plain sums per kind.
+//! Task resources, counted as sums per kind.
 
 use super::evaluate::{Place, Read, wrong};
 use super::{Fail, Reference};
@@ -8,7 +8,7 @@ use ratn_model::resource::ResourceOperation as Operation;
 use ratn_model::value::Value;
 
 impl Reference<'_> {
-    /// What an action, or a routine with all that it contains, asks for: its selectors have values, and what must be there is there.
+    /// Checks the requirements of an action or of a whole routine: selectors have values, and required resources exist.
     pub(super) fn asks(&mut self, state: &State, variables: &[(String, Value)]) -> Result<(), Fail> {
         let program = self.program;
         let mut wanted: Vec<&ResourceExpr> = Vec::new();
@@ -43,7 +43,7 @@ impl Reference<'_> {
         Ok(())
     }
 
-    /// What a state creates, deletes and, if it contains others, consumes at its end.
+    /// Creates and deletes a state's resources at its end; a composite state also consumes then.
     pub(super) fn operates(
         &mut self,
         state: &State,
@@ -68,7 +68,7 @@ impl Reference<'_> {
         Ok(())
     }
 
-    /// Every selector has a value; which resource it selects is not looked at.
+    /// Evaluates every selector; which resource it selects does not matter here.
     fn selected(
         &self,
         lines: &[&ResourceExpr],
@@ -91,7 +91,7 @@ impl Reference<'_> {
     }
 
     fn take(&mut self, line: &ResourceExpr) -> Result<(), Fail> {
-        // What is no task resource is not counted.
+        // Only task resources are counted.
         let Some(units) = self.result.units.get_mut(&line.kind) else { return Ok(()) };
         let left = units.checked_sub(line.count.thousandths());
         *units = left.ok_or(Fail::NotMine("a resource that is not there"))?;

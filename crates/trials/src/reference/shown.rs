@@ -1,7 +1,7 @@
-//! What a goal sees: the actual world, or of a projection what is read and nothing else.
+//! The facts that a goal sees: all of the actual world, or only the facts read of a projection.
 //!
-//! Read is what `reads` says (of the states around, too) and what the state's own expressions look up; an argument that has no value
-//! before the goal stands for any. A sensing state reads what it senses, too.
+//! Read are the facts in `reads` (also of the states around) and those that the state's own expressions look up; an argument without
+//! a value before the goal stands for any argument. A sensing state also reads what it senses.
 
 use super::Reference;
 use super::evaluate::{Place, Read, term};

@@ -1,4 +1,4 @@
-//! The reference reads expressions as `ratn-model` does: by hand for what the documents say, and at random.
+//! The reference evaluates expressions as `ratn-model` does: explicit cases from the documents, and random ones.
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
@@ -31,7 +31,7 @@ impl Names for NoNames {
     }
 }
 
-/// Facts and one variable for the evaluation of `ratn-model`.
+/// A scope for `ratn-model` with facts and one variable.
 struct Plain<'a>(&'a Facts, &'a Value);
 
 impl Scope for Plain<'_> {

@@ -1,4 +1,4 @@
-//! A state that waits. There is no clock: what comes, comes, and what does not is waited for until the time is up.
+//! States that wait. There is no clock: an event that comes ends the wait; without one, the wait ends by its timeout.
 
 use super::evaluate::Read;
 use super::walk::assign;
@@ -10,7 +10,7 @@ use ratn_model::value::Value;
 use ratn_model::wait::Wait;
 
 impl Reference<'_> {
-    /// Visits a state that waits; its outcome.
+    /// Visits a state that waits; returns its outcome.
     pub(super) fn wait(
         &mut self,
         state: &State,
@@ -37,7 +37,7 @@ impl Reference<'_> {
         Ok(outcome)
     }
 
-    /// What is waited for where the run is told to end may be on its way.
+    /// Notes what the environment may still change if the run is told to end during this wait.
     fn awaits(&mut self, state: &State, path: &str, variables: &[(String, Value)]) {
         if let Some(Wait::Condition(condition)) = state.wait()
             && condition.is_true(&self.place(variables, None)) == Ok(false)
@@ -72,7 +72,7 @@ impl Reference<'_> {
                 if condition.is_true(&self.place(variables, None))? {
                     return Ok((SUCCESS.to_owned(), Outputs::new()));
                 }
-                // Two parts that exclude each other.
+                // The condition has two parts that exclude each other.
                 match state.annotations.timeout_s {
                     Some(_) => Ok((late, Outputs::new())),
                     None => Err(Fail::NotMine("a wait without an end")),

@@ -1,4 +1,4 @@
-//! States that contain others: which state comes next, and what happens when one is left.
+//! Composite states: the order of inner states, and what happens at an exit.
 
 use super::evaluate::Read;
 use super::race::merge;
@@ -9,11 +9,11 @@ use ratn_model::program::{ABORTED, Again, Finally, PREEMPTED, Program, SUCCESS, 
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 
-/// Variables in sight; the last of a name counts.
+/// Variables in scope; the last one with a name counts.
 type Variables = Vec<(String, Value)>;
 
 impl Reference<'_> {
-    /// Visits a state at a path; its outcome. Where it is cut short, it says what that means.
+    /// Visits a state at a path; returns its outcome. If it is cut short, its effects for `preempted` are applied.
     pub(super) fn visit(
         &mut self,
         id: StateId,
@@ -27,7 +27,7 @@ impl Reference<'_> {
         let is_composite = !matches!(state.kind, StateKind::Action { .. });
         if ended == Err(Fail::Cut) && is_composite && !std::mem::take(&mut self.is_outside) {
             let has_finally = |state: &State| state.annotations.finally.is_some();
-            // A run that is told to end leaves what is inside of something that has to be done.
+            // A run that is told to end leaves the states inside of a state with `finally`.
             let is_left = self.has_lost() || around(self.program, state).skip(1).any(has_finally);
             if !has_finally(state) && is_left {
                 self.say_cut_short(state, variables);
@@ -77,7 +77,7 @@ impl Reference<'_> {
         }
         let outside = variables.len();
         for (name, value) in &state.variables {
-            // None sees another.
+            // No variable sees another one.
             let mut seen = variables.clone();
             seen.truncate(outside);
             match fails(value.read(&self.place(&seen, None)))? {
@@ -140,13 +140,13 @@ impl Reference<'_> {
                 Some(self.regions(regions, decide, path, variables, inside)?)
             }
         };
-        // What it is decided by has no value: it fails as the state, and its end changes nothing.
+        // Its predicate or list has no value: the state itself fails, and its exit changes nothing.
         let Some(left) = left else {
             variables.truncate(outside);
             return Ok(ABORTED.to_owned());
         };
         let end = self.leave(state, &left, variables);
-        // The task's own variables are seen by its outputs.
+        // The task's outputs may use the task's own variables.
         if id != Program::ROOT {
             variables.truncate(outside);
         }
@@ -159,7 +159,7 @@ impl Reference<'_> {
         }
     }
 
-    /// Every precondition holds.
+    /// Checks every precondition.
     pub(super) fn meets(&self, state: &State, variables: &Variables) -> Result<(), Fail> {
         for required in &state.annotations.requires {
             if !required.is_true(&self.place(variables, None))? {
@@ -169,7 +169,7 @@ impl Reference<'_> {
         Ok(())
     }
 
-    /// The values that a state assigns, where it ends well.
+    /// The values that a state assigns if it ends well.
     pub(super) fn assigned(
         &self,
         state: &State,
@@ -180,7 +180,7 @@ impl Reference<'_> {
         state.assign.iter().map(|(name, value)| Ok((name.clone(), value.read(&place)?))).collect()
     }
 
-    /// A list of states along their transitions; by which outcome it is left.
+    /// Executes a list of states along their transitions; returns the outcome by which it is left.
     fn list(
         &mut self,
         list: &[StateId],
@@ -190,7 +190,7 @@ impl Reference<'_> {
     ) -> Result<String, Fail> {
         let mut visits: BTreeMap<StateId, u32> = BTreeMap::new();
         let Some(mut current) = list.first().copied() else { return Ok(SUCCESS.to_owned()) };
-        // What the body of a loop has written before is of the iteration before, until it is passed.
+        // Outputs of the body's states belong to the iteration before until these states are passed.
         let around = self.program.state(current).parent;
         let is_body = around.is_some_and(|id| self.program.state(id).is_loop() || self.program.is_pass(id));
         let mut earlier: Vec<StateId> =
@@ -229,14 +229,14 @@ impl Reference<'_> {
         }
     }
 
-    /// What these states have written is not seen any more.
+    /// Removes the outputs of these states.
     fn lose(&mut self, states: Vec<StateId>) {
         for id in states {
             self.outputs.remove(&id);
         }
     }
 
-    /// A state is tried until it ends by another outcome than those after which it is tried again, or has had all its tries.
+    /// `retry`: tries a state until its outcome is not one of those to retry after, or all tries are used.
     fn again(
         &mut self,
         again: &Again,
@@ -252,7 +252,7 @@ impl Reference<'_> {
                 return Ok(outcome);
             }
             if around.children().any(|child| self.program.state(child).is_between_tries()) {
-                // The next try may have no place of its own, where it does not begin at all.
+                // The pause is a place of its own, even if the next try never begins.
                 self.may_be_cut()?;
                 self.tell(&below(path, &visit("pause")), in_routine, SUCCESS, (Outputs::new(), Outputs::new()));
             }
@@ -266,7 +266,7 @@ impl Reference<'_> {
         Err(Fail::NotMine("a retry without an end"))
     }
 
-    /// What is to be done at the end is done however it ends; if that fails, so does the whole.
+    /// `finally`: executed whatever the outcome of the body; if it fails, so does the whole state.
     fn lastly(
         &mut self,
         finally: &Finally,
@@ -295,7 +295,8 @@ impl Reference<'_> {
         Ok(if last == SUCCESS { outcome } else { last })
     }
 
-    /// It is done, whatever comes of it; then what is around is left. Of a run that is told to end nothing is in a routine any more.
+    /// Executes the `finally` of a state that is cut short, then leaves the states around. After the run was told to end, nothing
+    /// counts as inside of a routine.
     fn cut_lastly(
         &mut self,
         finally: &Finally,
@@ -347,7 +348,7 @@ impl Reference<'_> {
         Ok(None)
     }
 
-    /// All regions, one after another; the outcome.
+    /// Executes all regions, one after another; returns the outcome.
     fn regions(
         &mut self,
         regions: &[StateId],
@@ -370,7 +371,7 @@ impl Reference<'_> {
             merge(variables, &before, own);
         }
         beside.end(self, regions)?;
-        // How a region ended is seen when all have.
+        // Outcomes of regions become visible when all have ended.
         self.regions.extend(outcomes.iter().cloned());
         let outcomes: Vec<String> = outcomes.into_iter().map(|(_, outcome)| outcome).collect();
         self.decided(decide, variables, &outcomes, None)
@@ -403,7 +404,7 @@ impl Reference<'_> {
         }))
     }
 
-    /// What happens when a state is left: outputs, effects and resources; what it assigns.
+    /// The exit of a state: outputs, effects and resources; returns what it assigns.
     fn leave(&mut self, state: &State, outcome: &str, variables: &Variables) -> Result<Vec<(String, Value)>, Fail> {
         let is_good = !matches!(outcome, ABORTED | PREEMPTED | VIOLATED);
         let mut written = Outputs::new();
@@ -411,7 +412,7 @@ impl Reference<'_> {
             for output in state.outputs() {
                 match output.value.read(&self.place(variables, Some(&written))) {
                     Ok(value) => drop(written.insert(output.name.clone(), value)),
-                    // It was left early, before that was written.
+                    // The state was left early, before this was written.
                     Err(Fail::Unwritten(_)) if outcome != SUCCESS => {}
                     Err(problem) => return Err(problem),
                 }
@@ -431,7 +432,7 @@ impl Reference<'_> {
         Ok(assigned)
     }
 
-    /// What the states inside wrote when it was entered before is not seen.
+    /// Removes the outputs that inner states wrote when the state was entered before.
     fn forget(&mut self, id: StateId) {
         for child in self.program.state(id).children() {
             self.outputs.remove(&child);
@@ -441,7 +442,7 @@ impl Reference<'_> {
     }
 }
 
-/// Variables get new values, each the innermost of its name.
+/// Assigns new values, each to the innermost variable of its name.
 pub(super) fn assign(variables: &mut Variables, assigned: Vec<(String, Value)>) {
     for (name, value) in assigned {
         if let Some(variable) = variables.iter_mut().rev().find(|(known, _)| *known == name) {

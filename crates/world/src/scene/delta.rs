@@ -1,8 +1,7 @@
-//! Differences between two scenes: a planner that has a scene of a thousand objects is sent the two that moved.
+//! Differences between two scenes: a planner that has a scene of a thousand objects gets only the two that moved.
 //!
-//! A delta names the digest of the scene that it starts from and of the one it leads to. Applied to another it is refused, and what
-//! comes out is compared with what it should be; a reader without the base asks for [`SceneDelta::whole`]. [`Scenes`] keeps the last few
-//! by digest.
+//! A delta contains the digests of its start scene and of its target scene. It is refused for another start scene, and its result is
+//! checked; a reader without the start scene asks for [`SceneDelta::whole`]. [`Scenes`] keeps the last few scenes by digest.
 
 use super::live::LiveScene;
 use super::{Scene, SceneObject};
@@ -14,44 +13,44 @@ use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// The way from one scene to another.
+/// The difference between two scenes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SceneDelta {
-    /// What it starts from; `None`: from nothing.
+    /// The digest of the start scene; `None`: the empty scene.
     pub from: Option<Digest>,
-    /// What it leads to.
+    /// The digest of the target scene.
     pub to: Digest,
-    /// Where the robot's base stands.
+    /// Pose of the robot's base.
     pub base: Pose,
-    /// Individuals that are no objects any more, in order.
+    /// Individuals that are no longer objects, in order.
     pub gone: Vec<Term>,
-    /// Objects that are new or otherwise than before, in the order of individuals.
+    /// New or changed objects, in the order of individuals.
     pub changed: Vec<(Term, SceneObject)>,
 }
 
-/// A delta that does not lead where it should.
+/// Error: a delta does not lead to its target scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum DeltaError {
     /// It starts from another scene.
     #[error("the delta starts from scene {from}, and this is scene {found}; ask for the whole scene")]
     OtherBase {
-        /// What it starts from.
+        /// Digest of its start scene.
         from: Digest,
-        /// What it was applied to.
+        /// Digest of the scene to which it was applied.
         found: Digest,
     },
-    /// What comes out is not what was meant.
+    /// The result is another scene than the target.
     #[error("the delta leads to scene {found} instead of {to}; ask for the whole scene")]
     OtherResult {
-        /// What it should lead to.
+        /// Digest of its target scene.
         to: Digest,
-        /// What it leads to.
+        /// Digest of the result.
         found: Digest,
     },
 }
 
 impl SceneDelta {
-    /// From one scene to another; costs what they do not share.
+    /// The delta between two scenes; costs what they do not share.
     pub fn between(from: &LiveScene, to: &LiveScene) -> SceneDelta {
         let mut delta = SceneDelta { from: Some(from.digest()), ..SceneDelta::empty(to) };
         for item in from.objects.diff(&to.objects) {
@@ -68,16 +67,16 @@ impl SceneDelta {
         delta
     }
 
-    /// A scene from nothing.
+    /// The delta from the empty scene.
     pub fn whole(scene: &LiveScene) -> SceneDelta {
         let all = scene.objects.iter().map(|(individual, object)| (individual.clone(), object.as_ref().clone()));
         SceneDelta { changed: all.collect(), ..SceneDelta::empty(scene) }
     }
 
-    /// The scene that it leads to.
+    /// Applies the delta to a scene.
     ///
     /// # Errors
-    /// [`DeltaError`]: the caller asks for the whole scene then.
+    /// [`DeltaError`]: the caller then asks for the whole scene.
     pub fn apply(&self, scene: &LiveScene) -> Result<LiveScene, DeltaError> {
         let mut next = match self.from {
             None => LiveScene::default(),
@@ -98,12 +97,12 @@ impl SceneDelta {
         if found == self.to { Ok(next) } else { Err(DeltaError::OtherResult { to: self.to, found }) }
     }
 
-    /// How many objects it speaks of.
+    /// Number of objects in it.
     pub fn len(&self) -> usize {
         self.gone.len() + self.changed.len()
     }
 
-    /// Whether it changes nothing but, perhaps, the base.
+    /// Whether it contains no objects; the base may still differ.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -113,16 +112,16 @@ impl SceneDelta {
     }
 }
 
-/// The scenes used last, by digest; each shares with the others what they have in common.
+/// The most recently used scenes, by digest; they share what they have in common.
 #[derive(Debug, Clone)]
 pub struct Scenes {
-    /// The one used last comes last.
+    /// The most recently used scene is last.
     kept: VecDeque<(Digest, LiveScene, Arc<Scene>)>,
     limit: usize,
 }
 
 impl Scenes {
-    /// Keeps so many, at least one.
+    /// A cache for `limit` scenes, at least one.
     pub fn new(limit: usize) -> Scenes {
         Scenes { kept: VecDeque::new(), limit: limit.max(1) }
     }
@@ -136,15 +135,15 @@ impl Scenes {
         Some(scene)
     }
 
-    /// The digests kept, that used last first: what a delta may start from.
+    /// The digests in the cache, most recently used first: possible start scenes of a delta.
     pub fn digests(&self) -> impl Iterator<Item = Digest> {
         self.kept.iter().rev().map(|(digest, ..)| *digest)
     }
 
-    /// The scene that a delta leads to, kept from now on.
+    /// Applies a delta to its start scene and keeps the result.
     ///
     /// # Errors
-    /// [`DeltaError`] also where the scene that it starts from is not kept.
+    /// [`DeltaError`], also if the start scene is not in the cache.
     pub fn apply(&mut self, delta: &SceneDelta) -> Result<Arc<Scene>, DeltaError> {
         if let Some(scene) = self.get(delta.to) {
             return Ok(scene);

@@ -1,8 +1,8 @@
-//! A scene that follows its world: each change costs the objects that it moves, not the scene.
+//! A scene that follows its world: each change costs only the objects that it moves.
 //!
-//! A fact about an individual moves that individual, and whatever stands on it. The objects are a persistent map, so that a clone is a
-//! version that costs nothing and two versions are compared by what they do not share. The digest is the sum of those of the
-//! objects, so it follows as cheaply; it tells scenes apart, and is no defence against a caller that makes two scenes alike on purpose.
+//! A fact about an individual moves that individual and everything that stands on it. The objects are in a persistent map: clones cost
+//! nothing, and two versions are compared by what they do not share. The digest is the sum of the objects' digests, so it is updated as
+//! cheaply. It distinguishes scenes, but does not protect against a caller that constructs two scenes with equal digests on purpose.
 
 use super::{BASE, Placement, Scene, SceneError, SceneObject, Shape, base, object};
 use crate::digest::{Digest, Digester};
@@ -14,12 +14,12 @@ use ratn_model::value::Value;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// A scene, and what it takes to keep it up to date.
+/// A scene with the data to update it.
 #[derive(Debug, Clone)]
 pub struct LiveScene {
     pub(super) base: Pose,
     pub(super) objects: OrdMap<Term, Arc<SceneObject>>,
-    /// The sum of what the objects come to, in four lanes.
+    /// The sum of the objects' digests, in four lanes.
     sum: [u64; 4],
 }
 
@@ -29,7 +29,7 @@ impl Default for LiveScene {
     }
 }
 
-/// The same objects in the same places.
+/// Equal if the same objects are in the same places.
 impl PartialEq for LiveScene {
     fn eq(&self, other: &LiveScene) -> bool {
         self.base == other.base && self.objects == other.objects
@@ -50,11 +50,11 @@ impl LiveScene {
         Ok(scene)
     }
 
-    /// Follows a world from `before` to `after`, which is `before` with the changes; the individuals that were looked at. Costs
-    /// the changes, and what stands on what they move.
+    /// Follows the world from `before` to `after`, which is `before` with the changes; returns the number of individuals examined.
+    /// Costs the changes, and the objects on what they move.
     ///
     /// # Errors
-    /// As [`Scene::of`]; then the scene is as it was.
+    /// As [`Scene::of`]; the scene is then unchanged.
     pub fn update(&mut self, before: &World, after: &World, changes: &[Change]) -> Result<usize, SceneError> {
         let is_geometric = |change: &&Change| {
             let pattern = change.pattern();
@@ -86,17 +86,17 @@ impl LiveScene {
         Ok(all.len())
     }
 
-    /// How many objects there are.
+    /// Number of objects.
     pub fn len(&self) -> usize {
         self.objects.len()
     }
 
-    /// Whether there is none.
+    /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.objects.is_empty()
     }
 
-    /// What it comes to: equal for scenes with the same objects in the same places.
+    /// A digest that is equal for scenes with the same objects in the same places.
     pub fn digest(&self) -> Digest {
         let mut digester = Digester::default();
         digester.value(&Value::Pose(self.base));
@@ -105,12 +105,12 @@ impl LiveScene {
         digester.finish()
     }
 
-    /// The scene as it is now, for whoever plans in it; costs the scene.
+    /// The present scene as a [`Scene`], for planners; costs the scene.
     pub fn scene(&self) -> Scene {
         Scene { base: self.base, objects: self.objects.values().map(|object| object.as_ref().clone()).collect() }
     }
 
-    /// An object as it is from now on, or none.
+    /// Replaces an object, or removes it.
     pub(super) fn put(&mut self, individual: &Term, object: Option<SceneObject>) {
         let old = match object {
             Some(object) => {

@@ -1,5 +1,6 @@
-//! Estimated durations of nodes, and the longest remaining path: a node's own duration plus the longest of what waits for it: the
-//! readers of its outputs, and the next PIA in program order, which may not begin before every older instance has ended.
+//! Estimated durations of nodes, and the longest remaining path: a node's own duration plus the longest path behind it. Behind a
+//! node are the readers of its outputs, and the next PIA in program order, which may not begin before every older instance has
+//! ended.
 
 use super::{DEFAULT_DURATION_S, Dispatch};
 use crate::binding;
@@ -9,11 +10,11 @@ use crate::window::growth::environment::Binding;
 use crate::window::memory::Sight;
 use ratn_model::id::InstanceId;
 
-/// Up to this many instances the window is estimated anew whenever it grew; beyond, when it grew by this share.
+/// Up to this size the window is estimated again whenever it has grown, beyond it when it has grown by this share.
 const ALWAYS_ESTIMATED: usize = 64;
 const ESTIMATED_SHARE: usize = 2;
 
-/// What an instance is estimated to take, in seconds: it alone, and with the longest path behind it.
+/// Estimated duration of an instance, and of the longest path that begins with it, in seconds.
 pub(crate) struct Estimate {
     id: InstanceId,
     duration_s: f32,
@@ -21,7 +22,7 @@ pub(crate) struct Estimate {
 }
 
 impl Dispatch {
-    /// Whether a window of this size that grew by so much is to be estimated anew.
+    /// Whether a window of this size that has grown by `grown` instances is to be estimated again.
     pub(crate) fn is_estimate_due(size: usize, grown: usize) -> bool {
         if size <= ALWAYS_ESTIMATED { grown > 0 } else { grown * ESTIMATED_SHARE >= size }
     }
@@ -31,7 +32,7 @@ impl Dispatch {
         let graph = sight.graph;
         let ids = graph.ids();
         let size = usize::try_from(ids.end - ids.start).unwrap_or(0);
-        // By id: the longest path of those that read its outputs, and of the next PIA behind it.
+        // By id: the longest path of the readers of its outputs, and of the next PIA behind it.
         let (mut readers, mut pias) = (vec![0.0_f32; size], vec![0.0_f32; size]);
         let place = |id: InstanceId| {
             id.0.checked_sub(ids.start).and_then(|at| usize::try_from(at).ok()).filter(|at| *at < size)
@@ -66,7 +67,7 @@ impl Dispatch {
         estimates
     }
 
-    /// Takes estimates over; what a look-ahead has advised stays.
+    /// Stores estimates; urgencies advised by look-ahead stay.
     pub(crate) fn set_estimates(graph: &mut Graph, estimates: Vec<Estimate>) {
         for Estimate { id, duration_s, remaining_s } in estimates {
             if let Some(cell) = graph.dispatching(id) {
@@ -94,7 +95,7 @@ impl Dispatch {
         said.map_or(known.unwrap_or(DEFAULT_DURATION_S), |seconds| seconds as f32)
     }
 
-    /// A look-ahead found a better order: how long before the end each instance should begin, in seconds.
+    /// Stores the urgencies of new advice: how long before the end each instance should begin, in seconds.
     pub(crate) fn advise(graph: &mut Graph, urgency_s: &[(InstanceId, f64)]) {
         for (id, seconds) in urgency_s {
             if let Some(cell) = graph.dispatching(*id).filter(|_| seconds.is_finite()) {

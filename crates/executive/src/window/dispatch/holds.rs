@@ -1,7 +1,7 @@
-//! Who is held back: by what a look-ahead advised, an instance does not ask for resources that it could have, because others are to
-//! have them first. A dispatch that never waits cannot come to some of the best plans.
+//! Holds: by the advice of look-ahead, an instance does not ask for resources that it could have, because others are to have them
+//! first. Some of the best plans need this; a dispatch that never waits cannot follow them.
 //!
-//! Nobody is held back for ever: a hold ends when the others have begun, ended or gone, with the next advice, and after a bounded time.
+//! A hold ends when the others have begun, ended or left the window, with the next advice, and at the latest after a bounded time.
 
 use super::Dispatch;
 use crate::lookahead::Held;
@@ -12,10 +12,10 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-/// By who is held back.
+/// Holds, by the instance that is held back.
 pub(super) type Holds = BTreeMap<InstanceId, Hold>;
 
-/// For whom, and until when at most.
+/// The instances that begin first, and the hold's latest end.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Hold {
     until_begun: Vec<InstanceId>,
@@ -23,7 +23,7 @@ pub(super) struct Hold {
 }
 
 impl Dispatch {
-    /// Takes over who is to be held back: who was so far, and when the holds of the new ones end at the latest.
+    /// Replaces all holds. Returns the instances held before, and the new ones with the latest end of their holds.
     pub(crate) fn hold(
         &mut self,
         graph: &Graph,
@@ -40,18 +40,18 @@ impl Dispatch {
         (before.into_keys().collect(), self.holds.iter().map(|(id, hold)| (*id, hold.until)).collect())
     }
 
-    /// Whether somebody is to begin before it.
+    /// Whether an instance is held for another one.
     pub(crate) fn is_held(&self, graph: &Graph, id: InstanceId) -> bool {
         self.holds.get(&id).is_some_and(|hold| hold.until_begun.iter().any(|other| is_to_begin(graph, *other)))
     }
 
-    /// For whom it is held back, of those that have not begun.
+    /// The instances that are still to begin before it.
     pub(super) fn held_for(&self, graph: &Graph, id: InstanceId) -> impl Iterator<Item = InstanceId> {
         let hold = self.holds.get(&id).into_iter();
         hold.flat_map(|hold| &hold.until_begun).copied().filter(|other| is_to_begin(graph, *other))
     }
 
-    /// Those that are no longer held back, because the others have begun.
+    /// Takes the instances whose holds are over, because the others have begun.
     pub(crate) fn take_released(&mut self, graph: &Graph) -> Vec<InstanceId> {
         if self.holds.is_empty() {
             return Vec::new();
@@ -60,14 +60,14 @@ impl Dispatch {
         self.holds.extract_if(.., |_, hold| is_over(hold)).map(|(id, _)| id).collect()
     }
 
-    /// A hold has lasted as long as it may; whether it was in force.
+    /// Ends a hold whose time is over; true if it was in force.
     pub(crate) fn let_go(&mut self, id: InstanceId, now: Timestamp) -> bool {
         let is_over = self.holds.get(&id).is_some_and(|hold| hold.until <= now);
         is_over && self.holds.remove(&id).is_some()
     }
 }
 
-/// Whether it is there and has not begun.
+/// Whether an instance is in the window and has not begun.
 fn is_to_begin(graph: &Graph, id: InstanceId) -> bool {
     let has_begun = |instance: &crate::window::graph::instance::Instance| {
         instance.ended().is_some() || instance.node().is_none_or(|node| node.status.since().is_some())

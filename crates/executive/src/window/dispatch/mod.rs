@@ -1,8 +1,8 @@
 //! Dispatch: which instance gets resources first, and which speculative holder gives way.
 //!
-//! What is certain comes before what is speculative, then the longest remaining path (`estimate`), then program order. A look-ahead
-//! may have advised something better. A speculative node counts as much as its path is likely; it leaves the last room for
-//! projections to others, and gives back what it holds where it keeps a certain one from it.
+//! Certain instances come before speculative ones, then the longest remaining path counts (`estimate`), then program order; look-ahead may
+//! have advised a better order. A speculative node's urgency is multiplied by the probability of its path. Speculative nodes leave the last
+//! room for projections to others, and give way to certain nodes.
 
 mod estimate;
 mod holds;
@@ -19,49 +19,49 @@ use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// From the top: one bit that says "certain", the urgency, program order. The bits of a positive float are in its order, so
-/// the urgency of an unlikely path is small and still tells it from another.
+/// Bits of a priority, from the top: one bit for "certain", the urgency, program order. The bits of positive floats have the same order as
+/// their values, so the small urgencies of unlikely paths stay distinguishable.
 const URGENCY_BITS: u32 = 31;
 const ORDER_BITS: u32 = 31;
 const _: () = assert!(CERTAIN == 1 << (URGENCY_BITS + ORDER_BITS));
 
-/// How long a node is assumed to take that says nothing, in seconds.
+/// Assumed duration of a node without an estimate, in seconds.
 const DEFAULT_DURATION_S: f32 = 1.0;
 
-/// How urgent an instance is: part of the instance, private to this module.
+/// The urgency of an instance: part of the instance, private to this module.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct DispatchCell {
-    /// Estimated, in seconds.
+    /// Estimated duration, in seconds.
     duration_s: Option<f32>,
     /// The longest estimated path from its start to the end of the window, or what a look-ahead advised.
     remaining_s: Option<f32>,
     is_advised: bool,
 }
 
-/// Who is under way, who leaves room.
+/// Which instances are under way, and which leave room.
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct Dispatch {
-    /// How much there was of each kind of resource when the run began, where that is known.
+    /// Capacity of each resource kind when the run began, where it is known.
     capacity: BTreeMap<String, Quantity>,
-    /// What the task has made of each kind since, and what it has removed.
+    /// What the task has created of each kind since, and what it has deleted or consumed.
     #[serde(default)]
     made: BTreeMap<String, Quantity>,
     #[serde(default)]
     removed: BTreeMap<String, Quantity>,
-    /// By the path of the state, in seconds.
+    /// Learned durations by the path of the state, in seconds.
     learned_s: BTreeMap<String, f64>,
     /// Nodes under way: they have asked for resources, hold some, or run.
     active: BTreeSet<InstanceId>,
     /// Those among them that are speculative.
     speculative: BTreeSet<InstanceId>,
-    /// Those of these that take room for a projection.
+    /// Those speculative ones that take room for a projection.
     in_rooms: BTreeSet<InstanceId>,
-    /// Speculative nodes that leave room.
+    /// Speculative nodes that wait for room.
     stalled: BTreeSet<InstanceId>,
-    /// Who is held back.
+    /// The holds advised by look-ahead.
     #[serde(default)]
     holds: holds::Holds,
-    /// Certain nodes that have asked since the speculative ones were looked at.
+    /// Certain nodes that have asked since speculative holders were last checked.
     asked: Vec<InstanceId>,
 }
 
@@ -71,7 +71,7 @@ impl Dispatch {
         Dispatch { capacity, made, removed, learned_s, active, speculative, in_rooms, stalled, holds, asked }
     }
 
-    /// The task makes resources, or removes them.
+    /// Accounts for resource operations of the task.
     pub(crate) fn operated(&mut self, operations: &[Requirement]) {
         for operation in operations {
             let changed = match operation.operation {
@@ -83,7 +83,7 @@ impl Dispatch {
         }
     }
 
-    /// How much there is of a kind, as far as is known.
+    /// The present capacity of a kind, if it is known.
     fn there_is(&self, kind: &str) -> Option<Quantity> {
         let (offered, made) = (self.capacity.get(kind).copied(), self.made.get(kind).copied());
         offered.or(made)?;
@@ -96,7 +96,7 @@ impl Dispatch {
         self.active.iter().copied()
     }
 
-    /// The priority of an acquire: larger first.
+    /// The priority of an acquire; larger is served first.
     pub(crate) fn priority(&self, graph: &Graph, instance: &Instance) -> i64 {
         let certain = if graph.is_speculative(instance.segment) { 0 } else { CERTAIN };
         let remaining_s = instance.dispatch.remaining_s.or(instance.dispatch.duration_s).unwrap_or(DEFAULT_DURATION_S);
@@ -108,7 +108,7 @@ impl Dispatch {
         certain | (urgency << ORDER_BITS) | (greatest - order)
     }
 
-    /// A node asks for resources, or goes on without any.
+    /// A node asks for resources, or goes on because it needs none.
     pub(crate) fn begin(&mut self, graph: &Graph, plan: &Plan, instance: &Instance) {
         self.active.insert(instance.id);
         self.stalled.remove(&instance.id);
@@ -122,58 +122,58 @@ impl Dispatch {
         }
     }
 
-    /// It does not hold anything any more, nor does it act or look.
+    /// A node has ended or stopped: it holds nothing and runs nothing.
     pub(crate) fn end(&mut self, id: InstanceId) {
         self.active.remove(&id);
         self.speculative.remove(&id);
         self.in_rooms.remove(&id);
     }
 
-    /// It has left the window.
+    /// An instance has left the window.
     pub(crate) fn forget(&mut self, id: InstanceId) {
         self.end(id);
         self.stalled.remove(&id);
         self.holds.remove(&id);
     }
 
-    /// Its path is decided. Whether it has to ask anew, as somebody who is certain.
+    /// The path is decided. True if the instance has to ask again as a certain one.
     pub(crate) fn became_certain(&mut self, id: InstanceId) -> bool {
         self.in_rooms.remove(&id);
         self.stalled.remove(&id);
         self.speculative.remove(&id)
     }
 
-    /// A certain node, or a routine that is, has asked again.
+    /// A certain node, or a certain routine, has asked again.
     pub(crate) fn asks_again(&mut self, graph: &Graph, instance: &Instance) {
         if !graph.is_speculative(instance.segment) {
             self.asked.push(instance.id);
         }
     }
 
-    /// Whether it is under way, or asks, and may be in vain.
+    /// Whether it is under way on an undecided path.
     pub(crate) fn is_speculative(&self, id: InstanceId) -> bool {
         self.speculative.contains(&id)
     }
 
-    /// Whether a node may take room for a projection: a speculative one leaves the last to those that are not.
+    /// Whether a node may take room for a projection: a speculative one must leave the last room to certain ones.
     pub(crate) fn leaves_room(&self, graph: &Graph, instance: &Instance, requirements: &[Requirement]) -> bool {
         let needs = || requirements.iter().any(|r| r.kind == WORLD_MODEL);
         !graph.is_speculative(instance.segment) || !needs() || self.free_rooms().is_none_or(|free| free > 0)
     }
 
-    /// How many speculative nodes more may have a projection; `None` where nothing is known of how many there are.
+    /// Number of further projections for speculative nodes; `None` if the number of rooms is unknown or at most 1.
     fn free_rooms(&self) -> Option<usize> {
         let rooms = self.capacity.get(WORLD_MODEL)?.units() as usize;
-        // One is left to those that are certain, if there are more.
+        // One room is left to certain nodes, if there are several.
         if rooms <= 1 { None } else { Some((rooms - 1).saturating_sub(self.in_rooms.len())) }
     }
 
-    /// It waits until there is room.
+    /// A node waits for room for its projection.
     pub(crate) fn stall(&mut self, id: InstanceId) {
         self.stalled.insert(id);
     }
 
-    /// The most urgent of those that wait for room, as many as there is room for.
+    /// Takes the most urgent nodes that wait for room, as many as there is room for.
     pub(crate) fn take_stalled(&mut self, graph: &Graph) -> Vec<InstanceId> {
         if self.stalled.is_empty() {
             return Vec::new();
@@ -192,7 +192,7 @@ impl Dispatch {
         first
     }
 
-    /// Whoever waits for the resource manager with another priority than it would ask with now.
+    /// Instances whose acquire at the resource manager has an outdated priority.
     pub(crate) fn misplaced(&self, graph: &Graph) -> Vec<InstanceId> {
         let asking = |id: &InstanceId| match graph.node(*id)?.status {
             Status::Acquiring { priority } => Some((*id, priority)),
@@ -203,8 +203,8 @@ impl Dispatch {
         asked.filter(|(id, with)| now(*id) != Some(*with)).map(|(id, _)| id).collect()
     }
 
-    /// Speculative holders that keep certain nodes from what they have asked for: each with whom it gives way to, the least urgent
-    /// first. Looked at once for all that have asked.
+    /// Speculative holders that must give way to certain nodes, each with the node that needs its resources, the least urgent holder first.
+    /// Checked once for all certain nodes that have asked.
     pub(crate) fn in_the_way(&mut self, graph: &Graph, plan: &Plan) -> Vec<(InstanceId, InstanceId)> {
         let asked = std::mem::take(&mut self.asked);
         if self.speculative.is_empty() || asked.is_empty() {
@@ -222,7 +222,7 @@ impl Dispatch {
         for instance in self.active.iter().filter_map(|id| graph.get(*id)) {
             let is_certain = !self.speculative.contains(&instance.id);
             let holds = instance.node().is_some_and(|node| node.status.since().is_some());
-            // What is certain and waits shall be served, too.
+            // Certain nodes that wait count as if they held their resources.
             if !is_certain && !holds {
                 continue;
             }
@@ -253,8 +253,8 @@ impl Dispatch {
         order
     }
 
-    /// Speculative holders that may keep a certain node from what it has asked for, where counting does not tell: it is not known how much
-    /// there is, or one of them takes only what has certain attributes.
+    /// Speculative holders that may keep a certain node waiting, where counting cannot tell: the capacity is unknown, or one of the two
+    /// selects by attributes or conditions.
     pub(crate) fn perhaps_in_the_way(&self, graph: &Graph, plan: &Plan, asks: InstanceId) -> Vec<InstanceId> {
         let Some(instance) = graph.get(asks).filter(|instance| !graph.is_speculative(instance.segment)) else {
             return Vec::new();
@@ -274,8 +274,8 @@ impl Dispatch {
         holders.filter(|holder| keeps(holder)).map(|holder| holder.id).collect()
     }
 
-    /// Who holds only to improve a result what an instance that asks cannot have beside it, as far as is known how much there is; whoever has
-    /// improved for longest first.
+    /// Instances that only improve a result and must give way, because together with `asks` they exceed a known capacity; the oldest instances
+    /// give way first.
     pub(crate) fn too_much(
         &self,
         graph: &Graph,
@@ -307,7 +307,7 @@ impl Dispatch {
         in_the_way
     }
 
-    /// What is wrong, if anything: who is under way is active, and nobody else.
+    /// Checks that exactly the instances under way are active.
     pub(crate) fn check_invariants(&self, graph: &Graph) -> Result<(), String> {
         for instance in graph.iter() {
             if instance.is_under_way() != self.active.contains(&instance.id) {
@@ -331,7 +331,7 @@ impl Dispatch {
     }
 }
 
-/// The kinds that the node of a state blocks, and how much.
+/// The kinds that a node blocks, with their amounts.
 fn blocks(plan: &Plan, state: StateId) -> impl Iterator<Item = (&str, Quantity)> {
     let requirements = plan.state(state).requirements.iter();
     requirements.filter(|r| r.operation == ResourceOperation::Block).map(|r| (r.kind.as_str(), r.count))

@@ -1,4 +1,4 @@
-//! The remaining work as a scheduling problem for a look-ahead: of an undecided decision the likelier way on.
+//! The remaining work as a scheduling problem for look-ahead; of an undecided decision the likelier way.
 
 use super::{DEFAULT_DURATION_S, Dispatch, blocks};
 use crate::lookahead::{Problem, Task};
@@ -8,10 +8,10 @@ use ratn_model::id::InstanceId;
 use ratn_model::time::Timestamp;
 use std::collections::BTreeMap;
 
-/// A window is looked ahead for so many nodes; what comes later keeps its longest remaining path.
+/// Limit of the nodes that look-ahead plans; later ones keep their longest remaining path.
 const MAX_TASKS: usize = 2_000;
 
-/// What takes longer is planned as if it took so long, in seconds: a year.
+/// Upper limit of a planned duration, in seconds: a year.
 const LONGEST_S: f64 = 365.0 * 24.0 * 3600.0;
 
 impl Dispatch {
@@ -19,7 +19,7 @@ impl Dispatch {
         let graph = sight.graph;
         let mut places: BTreeMap<InstanceId, usize> = BTreeMap::new();
         let mut tasks: Vec<Task> = Vec::new();
-        // Per line, the last PIA and what came since: a PIA waits for all of it.
+        // Per line, the last PIA and the tasks since then: the next PIA waits for all of them.
         let mut since: BTreeMap<LineId, Vec<usize>> = BTreeMap::new();
         let is_open = |instance: &&Instance| {
             instance.role().is_none() && instance.ended().is_none() && graph.is_likeliest(instance.segment)

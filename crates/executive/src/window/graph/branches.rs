@@ -1,41 +1,40 @@
-//! Branches: the ways on from decisions that are not made. The segment of a branch is the stretch up to the next decision.
+//! Branches: the possible ways on from open decisions. The segment of a branch extends to the next decision.
 //!
-//! A segment without an open branch is certain. Decisions are made on certain paths only, so the open branches are a tree that is
-//! pruned from its root. A branch knows how likely it is *given* that its parent is taken: when a decision is made, everything
-//! behind it becomes likelier by itself.
+//! A segment behind no open decision is certain. Decisions are made on certain paths only, so the open branches form a tree that
+//! is pruned from its root. The probability of a branch is *conditional* on its parent being taken. So with each decision,
+//! everything behind it becomes more likely without further work.
 
 use super::instance::SegmentId;
 use ratn_model::id::InstanceId;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// No path counts as less likely than this: its share stays a number that can be divided and compared.
+/// Lower limit of a path's probability, so that it can be divided and compared.
 const LEAST_PROBABILITY: f64 = 1e-30;
 
-/// One way on from a decision.
+/// One possible way on from a decision.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct Branch {
     parent: SegmentId,
-    /// The instance that decides.
+    /// The deciding instance.
     decision: InstanceId,
-    /// How likely it is taken, of all ways on from this decision.
+    /// Probability of this way, among all ways on from this decision.
     share: f64,
-    /// It may be expanded.
+    /// Whether it may be expanded.
     is_expanded: bool,
     members: Vec<InstanceId>,
 }
 
-/// The branches that are open.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(super) struct Branches {
     all: BTreeMap<SegmentId, Branch>,
-    /// How many may be expanded.
+    /// Number of branches that may be expanded.
     expanded: usize,
     last: SegmentId,
 }
 
 impl Branches {
-    /// Opens a way on from a decision.
+    /// Adds a way on from a decision.
     pub(super) fn open(&mut self, parent: SegmentId, decision: InstanceId, share: f64) -> SegmentId {
         self.last += 1;
         let branch = Branch { parent, decision, share, is_expanded: false, members: Vec::new() };
@@ -43,7 +42,7 @@ impl Branches {
         self.last
     }
 
-    /// The branch is taken: its segment is certain from now on. Its members.
+    /// Takes a branch: its segment becomes certain. Returns its members.
     pub(super) fn take(&mut self, segment: SegmentId) -> Vec<InstanceId> {
         self.remove(segment).map(|branch| branch.members).unwrap_or_default()
     }
@@ -64,12 +63,11 @@ impl Branches {
         self.all.is_empty()
     }
 
-    /// Whether the decision on the way to a segment is not made.
     pub(super) fn is_open(&self, segment: SegmentId) -> bool {
         self.all.contains_key(&segment)
     }
 
-    /// Puts an instance into the segment it was expanded in. Whether it is speculative.
+    /// Adds an instance to the segment in which it was expanded; true if it is speculative.
     pub(super) fn join(&mut self, segment: SegmentId, id: InstanceId) -> bool {
         match self.all.get_mut(&segment) {
             Some(branch) => {
@@ -80,7 +78,7 @@ impl Branches {
         }
     }
 
-    /// The oldest decision on the way to a segment that is not made.
+    /// The oldest open decision on the way to a segment.
     pub(super) fn undecided(&self, segment: SegmentId) -> Option<InstanceId> {
         self.way(segment).last().map(|branch| branch.decision)
     }
@@ -90,12 +88,12 @@ impl Branches {
         std::iter::successors(self.all.get(&segment), |branch| self.all.get(&branch.parent))
     }
 
-    /// How likely a segment is taken: 1 where it is certain.
+    /// Probability of a segment; 1 if it is certain.
     pub(super) fn probability(&self, segment: SegmentId) -> f64 {
         self.way(segment).map(|branch| branch.share).product::<f64>().max(LEAST_PROBABILITY)
     }
 
-    /// Whether no decision on the way to a segment is more likely to go another way.
+    /// Whether the segment lies on the most likely way of every open decision before it.
     pub(super) fn is_likeliest(&self, segment: SegmentId) -> bool {
         let mut at = segment;
         while let Some(branch) = self.all.get(&at) {
@@ -111,12 +109,12 @@ impl Branches {
         true
     }
 
-    /// Whether a branch that may be expanded, or none, is open for a segment.
+    /// Whether a segment may grow: it is certain, or its branch may be expanded.
     pub(super) fn is_awake(&self, segment: SegmentId) -> bool {
         self.all.get(&segment).is_none_or(|branch| branch.is_expanded)
     }
 
-    /// Lets branches be expanded, the likelier ones first, until there are `width`.
+    /// Lets branches be expanded, the most likely ones first, up to `width`.
     pub(super) fn awaken(&mut self, width: usize) {
         while self.expanded < width && self.expanded < self.all.len() {
             let asleep = self.all.iter().filter(|(_, branch)| !branch.is_expanded);
@@ -129,7 +127,7 @@ impl Branches {
         }
     }
 
-    /// The branches behind lost segments or decisions that are not among the lost ones yet.
+    /// The branches behind lost segments or decisions, except those already lost.
     pub(super) fn behind(&self, segments: &BTreeSet<SegmentId>, lost: &BTreeSet<InstanceId>) -> Vec<SegmentId> {
         let is_behind = |(segment, branch): &(&SegmentId, &Branch)| {
             !segments.contains(segment) && (segments.contains(&branch.parent) || lost.contains(&branch.decision))
@@ -137,7 +135,7 @@ impl Branches {
         self.all.iter().filter(is_behind).map(|(segment, _)| *segment).collect()
     }
 
-    /// What is wrong with the tree, if anything.
+    /// Checks the tree.
     pub(super) fn check_invariants(&self, is_alive: impl Fn(InstanceId) -> bool) -> Result<(), String> {
         for (segment, branch) in &self.all {
             if !is_alive(branch.decision) {

@@ -7,7 +7,7 @@ use crate::interpreter::Interpreter;
 use crate::window::growth::environment::{Collector, Restored};
 
 impl Graph {
-    /// What its instances share.
+    /// Collects what its instances share.
     pub(crate) fn collect<'a>(&'a self, places: &mut Collector<'a>) {
         for instance in self.iter() {
             places.add(&instance.environment);
@@ -15,7 +15,7 @@ impl Graph {
         }
     }
 
-    /// Gives its instances back what they shared.
+    /// Restores the environments and producers of its instances.
     pub(crate) fn restore(&mut self, places: &mut Restored) -> Result<(), Broken> {
         for instance in self.instances.iter_mut() {
             instance.environment = places.environment()?;

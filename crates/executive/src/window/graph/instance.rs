@@ -1,4 +1,4 @@
-//! One visit of a state in the window: a node, which something is executed for, or a marker, which only stands for a place.
+//! One visit of a state in the window: a node, for which something is executed, or a marker, which only stands for a place.
 
 use crate::binding::Outputs;
 use crate::checkpoint::leases;
@@ -20,7 +20,7 @@ use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
 use std::sync::Arc;
 
-/// A stretch of the window between two decisions. It is certain when no branch of that number is open.
+/// Number of a stretch of the window between two decisions. It is certain unless a branch with this number is open.
 pub(crate) type SegmentId = u64;
 /// A thread of control: the task's, or a region's.
 pub(crate) type LineId = u64;
@@ -37,15 +37,15 @@ pub(crate) struct Instance {
     pub(crate) producer: Option<Arc<Producer>>,
     pub(crate) line: LineId,
     pub(crate) segment: SegmentId,
-    /// How many instances of its line are before it on its path.
+    /// Number of instances before it on its line, along its path.
     pub(crate) position: u64,
-    /// How many states were entered and iterations begun between the instance before it and this one, itself included.
+    /// Number of states entered and iterations begun since the instance before it, including itself.
     pub(crate) visits_before: u32,
-    /// What follows: one arm, or one per branch. Empty where the path ends or nothing is expanded behind it yet.
+    /// Its continuations: one arm, or one per branch. Empty if the path ends or nothing has been expanded behind it yet.
     pub(crate) arms: SmallVec<[Arm; 1]>,
-    /// Everything older on its line has retired, or runs imprecisely beside it.
+    /// Whether everything older on its line has retired, or runs as a detached PIA.
     pub(crate) is_head: bool,
-    /// Its result cannot change any more: [`crate::window::memory::settled`].
+    /// Whether its result can no longer change: [`crate::window::memory::settled`].
     pub(crate) is_settled: bool,
     pub(crate) body: Body,
     /// Private to [`crate::window::memory`].
@@ -56,7 +56,7 @@ pub(crate) struct Instance {
     pub(crate) dispatch: DispatchCell,
 }
 
-/// What is only there of a node, or only of a marker.
+/// The fields of a node, or those of a marker.
 #[derive(Serialize, Deserialize)]
 pub(crate) enum Body {
     /// An action, or a routine: something is executed.
@@ -70,22 +70,22 @@ pub(crate) enum Body {
 pub(crate) struct Node {
     pub(crate) nature: NodeNature,
     pub(crate) status: Status,
-    /// Every goal and every projection has one of its own.
+    /// Every goal and every projection has its own attempt number.
     pub(crate) attempt: u32,
-    /// Of `retry`, from 1.
+    /// Number of the try (see `retry`), from 1.
     pub(crate) tries: u32,
-    /// How many attempts its worker's death has cost.
+    /// Number of attempts that crashed.
     pub(crate) crashes: u32,
     pub(crate) not_before: Timestamp,
-    /// What its result is made of.
+    /// The inputs of its result.
     pub(crate) seen: Option<Box<Seen>>,
-    /// Its goal was under way when it ended.
+    /// Whether its goal was under way when it ended.
     pub(crate) has_acted: bool,
-    /// It runs although younger ones of its line go on: an imprecise PIA.
+    /// Whether it is an imprecise PIA that runs while younger instances of its line go on.
     pub(crate) is_detached: bool,
 }
 
-/// How far a node is. Retired and discarded ones are not in the window any more.
+/// The status of a node. Retired and discarded nodes are no longer in the window.
 ///
 /// ```text
 /// Expanded ─► Acquiring ─► Granted ─► Projecting ─► Running ─► Finished
@@ -96,7 +96,7 @@ pub(crate) struct Node {
 pub(crate) enum Status {
     /// Waits for older instances.
     Expanded,
-    /// Waits for the resource manager, which was asked with this priority.
+    /// Waits for the resource manager, with this priority.
     Acquiring { priority: i64 },
     /// Has its resources; the operator holds it.
     Granted(Held),
@@ -104,13 +104,13 @@ pub(crate) enum Status {
     Projecting(Held),
     /// Its goal is under way.
     Running(Held),
-    /// So is what it contains: a routine.
+    /// The parts of a routine are under way, since this time.
     RunningRoutine(Box<Interpreter>, Timestamp),
     /// Its result is known.
     Finished(Box<Ended>),
 }
 
-/// What a node has got.
+/// What a node holds.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Held {
     #[serde(with = "leases")]
@@ -124,16 +124,15 @@ pub(crate) struct Held {
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Marker {
     pub(crate) role: Role,
-    /// Exit, region end, end: the outcome by which the state is left.
+    /// Of an exit, a region end or the end: the outcome by which the state is left.
     pub(crate) leaves_by: Outcome,
-    /// Why it is left by that outcome.
+    /// Reason of that outcome.
     pub(crate) because: Option<Arc<str>>,
     pub(crate) ended: Option<Box<Ended>>,
-    /// Entry, exit: what its result is made of.
+    /// Of an entry or exit: the facts on which its result is based.
     pub(crate) seen: Option<Box<Seen>>,
 }
 
-/// What a marker stands for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Role {
     /// Decides between two branches.
@@ -144,38 +143,38 @@ pub(crate) enum Role {
     Loop,
     /// The preconditions and variables of a composite state.
     Entry,
-    /// What a composite state still does when it is left.
+    /// The exit of a composite state.
     Exit,
     /// Where regions begin.
     Fork,
-    /// Where a region has ended.
+    /// The end of a region.
     RegionEnd,
-    /// Where all regions have ended: the decider.
+    /// The end of a concurrency: the decider.
     Join,
     /// The end of the task.
     End,
 }
 
-/// How an instance ended.
+/// The end of an instance.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Ended {
     pub(crate) outcome: Arc<str>,
     pub(crate) outputs: Outputs,
     pub(crate) reason: String,
     pub(crate) changes: Changed,
-    /// A routine that went on and on without an action: the run ends when that is real.
+    /// Whether it is a routine that went in circles; then the run ends when it retires.
     pub(crate) in_circles: bool,
 }
 
-/// What an ended instance changes when it retires.
+/// The changes that an ended instance makes when it retires.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) enum Changed {
-    /// What it declares for its outcome, with what was measured, and what is known of how.
+    /// The declared effects of its outcome, with measured values and their evidence.
     Declared(Vec<(FactKey, Value)>, Evidence),
-    /// Exactly this: a routine on a projection (or nothing: a routine in the actual world has made its changes already,
-    /// and what was never executed has none).
+    /// Exactly these: a routine on a projection. None for a routine in the actual world, which has committed already, and
+    /// for a node that was never executed.
     Exactly(Made),
-    /// Nothing: it waited. What it was taken to change, as the root shows it.
+    /// None, because it waited; these are the changes that it foresaw, as the root shows them.
     Foreseen(Vec<Change>),
 }
 
@@ -202,7 +201,7 @@ impl Ended {
         Ended::with(SUCCESS, outputs)
     }
 
-    /// It was never executed, or nobody knows how far: it changes nothing.
+    /// An end without changes: it was never executed, or how far it came is unknown.
     pub(crate) fn aborted(reason: String) -> Ended {
         let changes = Changed::Exactly(Made::default());
         Ended { outcome: ABORTED.into(), outputs: Outputs::new(), reason, changes, in_circles: false }
@@ -224,12 +223,12 @@ impl Instance {
         }
     }
 
-    /// What it stands for; `None` for a node.
+    /// The role of a marker; `None` for a node.
     pub(crate) fn role(&self) -> Option<Role> {
         self.marker().map(|marker| marker.role)
     }
 
-    /// How it ended, if it has.
+    /// Its end, if it has ended.
     pub(crate) fn ended(&self) -> Option<&Ended> {
         match &self.body {
             Body::Node(Node { status: Status::Finished(ended), .. }) => Some(ended),
@@ -238,7 +237,7 @@ impl Instance {
         }
     }
 
-    /// What its result is made of.
+    /// The inputs of its result.
     pub(crate) fn seen(&self) -> Option<&Seen> {
         match &self.body {
             Body::Node(node) => node.seen.as_deref(),
@@ -249,17 +248,16 @@ impl Instance {
     /// Its outputs, if it has ended well.
     pub(crate) fn outputs(&self) -> Option<&Outputs> {
         let ended = self.ended()?;
-        // How a region ended is known also where it ended badly.
+        // The outcome of a region counts as an output even if the region failed.
         let counts = self.role() == Some(Role::RegionEnd) || gives_outputs(&ended.outcome);
         counts.then_some(&ended.outputs)
     }
 
-    /// Whether it occupies resources or a worker now, or asks for them.
+    /// Whether it holds resources or a worker, or asks for them.
     pub(crate) fn is_under_way(&self) -> bool {
         self.node().is_some_and(|node| !matches!(node.status, Status::Expanded | Status::Finished(_)))
     }
 
-    /// Whether it is an action or routine that may change the environment.
     pub(crate) fn is_pia(&self) -> bool {
         self.node().is_some_and(|node| node.nature == NodeNature::Irreversible)
     }
@@ -273,29 +271,29 @@ impl Instance {
         self.node().is_some_and(|node| node.is_detached)
     }
 
-    /// Whether it is a motion whose path was left: it ends as it ends, and leads nowhere.
+    /// Whether it is a running motion whose path was left: it runs to its end, and nothing follows it.
     pub(crate) fn is_orphan(&self) -> bool {
         self.is_detached() && self.arms.is_empty()
     }
 
-    /// Whether there are several ways on and it is not known which.
+    /// Whether it has several ways on and is not decided.
     pub(crate) fn is_undecided(&self) -> bool {
         self.arms.len() > 1
     }
 
-    /// The arm that an outcome of its state takes.
+    /// The arm to which an outcome of its state belongs.
     pub(crate) fn arm_of(&self, outcome: Outcome) -> Option<usize> {
         self.arms.iter().position(|arm| outcome < 64 && arm.outcomes & (1 << outcome) != 0)
     }
 }
 
 impl Status {
-    /// Whether its goal, or what it contains, is under way.
+    /// Whether its goal, or its routine, is under way.
     pub(crate) fn is_running(&self) -> bool {
         matches!(self, Status::Running(_) | Status::RunningRoutine(..))
     }
 
-    /// Since when it has its resources.
+    /// When it got its resources.
     pub(crate) fn since(&self) -> Option<Timestamp> {
         match self {
             Status::Granted(held) | Status::Projecting(held) | Status::Running(held) => Some(held.since),

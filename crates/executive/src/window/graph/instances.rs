@@ -5,7 +5,8 @@ use ratn_model::id::InstanceId;
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 
-/// The table of instances. Ids grow; what has left the window leaves a hole until everything older has left, too.
+/// The table of instances. Ids increase; an instance that left the window leaves a hole until everything older has
+/// left, too.
 #[derive(Default, Serialize, Deserialize)]
 pub(super) struct Instances {
     first: u64,
@@ -31,12 +32,12 @@ impl Instances {
         self.slots.get_mut(place)?.as_deref_mut()
     }
 
-    /// Adds the youngest.
+    /// Adds the youngest instance.
     pub(super) fn push(&mut self, instance: Box<Instance>) {
         if self.slots.is_empty() {
             self.first = instance.id.0;
         }
-        // Ids given to what never enters the window (nodes inside of routines) are holes.
+        // Ids of nodes inside of routines never enter the window; they are holes.
         while self.first + (self.slots.len() as u64) < instance.id.0 {
             self.slots.push_back(None);
         }
@@ -55,7 +56,7 @@ impl Instances {
         Some(removed)
     }
 
-    /// All, oldest id first.
+    /// All instances, oldest id first.
     pub(super) fn iter(&self) -> impl DoubleEndedIterator<Item = &Instance> {
         self.slots.iter().filter_map(Option::as_deref)
     }
@@ -64,7 +65,7 @@ impl Instances {
         self.slots.iter_mut().filter_map(Option::as_deref_mut)
     }
 
-    /// The ids that are in use, and holes between them.
+    /// The range of ids in use, including holes.
     pub(super) fn ids(&self) -> std::ops::Range<u64> {
         self.first..self.first + self.slots.len() as u64
     }

@@ -1,4 +1,4 @@
-//! Lines: threads of control, the task's and one per region. Each retires in program order, so each has a head.
+//! Lines: threads of control, the task's and one per region. Each line retires in program order, so each has a head.
 
 use super::instance::LineId;
 use ratn_model::id::InstanceId;
@@ -13,19 +13,18 @@ pub(crate) const MAIN: LineId = 0;
 struct Line {
     /// The oldest instance that has not retired.
     head: Option<InstanceId>,
-    /// Its position, or that of the next.
+    /// The position of the head, or that of the next instance.
     floor: u64,
-    /// Regions of the fork that retired last, that have not ended: the line waits for them.
+    /// Number of regions of the last retired fork that have not ended; the line waits for them.
     open_regions: usize,
-    /// Its fork has retired.
+    /// Whether its fork has retired.
     is_active: bool,
-    /// The fork it began at.
+    /// The fork at which it begins.
     fork: Option<InstanceId>,
-    /// How many states were entered and iterations begun since a node of it was started last.
+    /// Number of states entered and iterations begun since the last node that was started.
     idle_visits: u32,
 }
 
-/// All lines.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Lines {
     all: BTreeMap<LineId, Line>,
@@ -33,12 +32,12 @@ pub(super) struct Lines {
 }
 
 impl Lines {
-    /// The task's line alone.
+    /// The task's line only.
     pub(super) fn new() -> Lines {
         Lines { all: BTreeMap::from([(MAIN, Line { is_active: true, ..Line::default() })]), last: MAIN }
     }
 
-    /// A region's line, which begins when its fork retires.
+    /// Adds the line of a region; it begins when its fork retires.
     pub(super) fn open(&mut self, fork: InstanceId) -> LineId {
         self.last += 1;
         self.all.insert(self.last, Line { fork: Some(fork), ..Line::default() });
@@ -49,13 +48,12 @@ impl Lines {
         self.all.contains_key(&line)
     }
 
-    /// The next line after another whose fork has retired.
+    /// The next line after `after` whose fork has retired.
     pub(super) fn next_active(&self, after: Option<LineId>) -> Option<LineId> {
         let from = after.map_or(0, |line| line + 1);
         self.all.range(from..).find(|(_, line)| line.is_active).map(|(id, _)| *id)
     }
 
-    /// The oldest instance of a line, unless the line waits for regions.
     pub(super) fn head(&self, line: LineId) -> Option<InstanceId> {
         self.all.get(&line).filter(|line| line.open_regions == 0)?.head
     }
@@ -73,7 +71,7 @@ impl Lines {
         self.all.get(&line)?.fork
     }
 
-    /// Gives a line its oldest instance, at a position. Whether that may become real now.
+    /// Sets the head of a line and its position; returns whether the head may retire now.
     pub(super) fn set_head(&mut self, line: LineId, head: Option<(InstanceId, u64)>) -> bool {
         let Some(line) = self.all.get_mut(&line) else { return false };
         line.head = head.map(|(id, _)| id);
@@ -83,7 +81,7 @@ impl Lines {
         head.is_some() && line.is_active && line.open_regions == 0
     }
 
-    /// Everything up to a position has retired.
+    /// Everything on the line up to a position has retired.
     pub(super) fn pass(&mut self, line: LineId, position: u64) {
         if let Some(line) = self.all.get_mut(&line) {
             line.head = None;
@@ -91,28 +89,27 @@ impl Lines {
         }
     }
 
-    /// An instance is not the oldest of its line any more, if it was.
+    /// Removes an instance as the head of its line, if it was the head.
     pub(super) fn leave_head(&mut self, line: LineId, id: InstanceId) {
         if let Some(line) = self.all.get_mut(&line).filter(|line| line.head == Some(id)) {
             line.head = None;
         }
     }
 
-    /// A line's fork has retired: the head that it may have.
+    /// The fork of a line has retired: returns the line's head.
     pub(super) fn activate(&mut self, line: LineId) -> Option<InstanceId> {
         let line = self.all.get_mut(&line)?;
         line.is_active = true;
         line.head
     }
 
-    /// A line waits for so many regions.
     pub(super) fn wait_for_regions(&mut self, line: LineId, regions: usize) {
         if let Some(line) = self.all.get_mut(&line) {
             line.open_regions = regions;
         }
     }
 
-    /// A region of a line has ended. Whether it was the last.
+    /// A region of the line has ended; true if it was the last.
     pub(super) fn region_ended(&mut self, line: LineId) -> bool {
         let Some(line) = self.all.get_mut(&line) else { return false };
         line.open_regions = line.open_regions.saturating_sub(1);
@@ -124,7 +121,7 @@ impl Lines {
         self.all.get(&line).is_some_and(|line| line.open_regions == 0 && line.head.is_none())
     }
 
-    /// The line waits for no region any more; the oldest instance that it had.
+    /// The line stops waiting for regions; returns its head.
     pub(super) fn stop(&mut self, line: LineId) -> Option<InstanceId> {
         let line = self.all.get_mut(&line)?;
         line.open_regions = 0;
@@ -135,12 +132,12 @@ impl Lines {
         self.all.remove(&line)?.fork
     }
 
-    /// How many states were entered and iterations begun since a node was started last.
+    /// Number of states entered and iterations begun since the last node that was started.
     pub(super) fn idle_visits(&self, line: LineId) -> u32 {
         self.all.get(&line).map_or(0, |line| line.idle_visits)
     }
 
-    /// An instance of a line has retired after so many visits; whether it was started.
+    /// An instance has retired after this number of visits; a started one resets the count.
     pub(super) fn count_visits(&mut self, line: LineId, visits: u32, started: bool) {
         if let Some(line) = self.all.get_mut(&line) {
             line.idle_visits = if started { 0 } else { line.idle_visits.saturating_add(visits) };

@@ -1,14 +1,14 @@
-//! The graph of instances: what is in the window, what follows what, on which line and branch, and what retires next.
+//! The graph of instances: the contents of the window, their order, their lines and branches, and what retires next.
 //!
-//! It owns the instances. Everybody may look at them; what changes them is a verb here. It knows nothing of the world, of
-//! resources or of how the window grows.
+//! It owns the instances. Others may read them; every change is a method here. It knows nothing of the world, of resources or
+//! of how the window grows.
 //!
 //! | | |
 //! |---|---|
 //! | `instance`, `instances` | one visit of a state; all of them by id |
 //! | `lines` | threads of control and their heads |
-//! | `branches` | decisions that are not made, how likely each way on is |
-//! | `prune` | what is lost when a path is left |
+//! | `branches` | open decisions, and the probability of each way on |
+//! | `prune` | the instances that are lost when a path is left |
 //! | `node` | the life of one node |
 
 mod branches;
@@ -38,24 +38,23 @@ use std::collections::{BTreeMap, BTreeSet};
 /// A fork whose join has not retired.
 #[derive(Debug, Serialize, Deserialize)]
 struct Fork {
-    /// Where the fork stands.
+    /// The line on which the fork stands.
     line: LineId,
     regions: Vec<LineId>,
     join: Option<InstanceId>,
 }
 
-/// The graph.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Graph {
     instances: Instances,
     lines: Lines,
     branches: Branches,
     forks: BTreeMap<InstanceId, Fork>,
-    /// Of joins, the links of chains in which writers of several regions stand.
+    /// By join, the links of chains that have writers in several regions.
     joins: BTreeMap<InstanceId, Vec<(Chain, Link)>>,
-    /// Imprecise PIAs that still run although younger instances have retired.
+    /// Detached PIAs: imprecise ones that still run although younger instances have retired.
     detached: BTreeSet<InstanceId>,
-    /// To be looked at: new ones, and those that have become heads.
+    /// Instances to be examined: new ones, and new heads.
     touched: Vec<InstanceId>,
 }
 
@@ -89,24 +88,24 @@ impl Graph {
         self.instances.len()
     }
 
-    /// The ids that are in use, and holes between them.
+    /// The range of ids in use, including holes.
     pub(crate) fn ids(&self) -> std::ops::Range<u64> {
         self.instances.ids()
     }
 
-    /// Those that are new or have become heads since this was asked last.
+    /// Takes the instances that are new or have become heads since the last call.
     pub(crate) fn take_touched(&mut self) -> Vec<InstanceId> {
         std::mem::take(&mut self.touched)
     }
 
-    /// Whether there are any.
+    /// Whether there are any such instances.
     pub(crate) fn has_touched(&self) -> bool {
         !self.touched.is_empty()
     }
 
     // ── growing ──
 
-    /// Adds an instance behind the last one of a path. Whether it is speculative.
+    /// Adds an instance behind the last one of a path; true if it is speculative.
     pub(crate) fn append(&mut self, instance: Box<Instance>, tail: Option<(InstanceId, usize)>) -> bool {
         let (id, line, segment, position) = (instance.id, instance.line, instance.segment, instance.position);
         let is_join = instance.role() == Some(Role::Join);
@@ -128,7 +127,6 @@ impl Graph {
         self.branches.join(segment, id)
     }
 
-    /// It goes on one way.
     pub(crate) fn single_arm(&mut self, id: InstanceId, outcomes: Outcomes) {
         if let Some(instance) = self.instances.get_mut(id) {
             let segment = instance.segment;
@@ -136,7 +134,7 @@ impl Graph {
         }
     }
 
-    /// One more way on from a decision, with its share of all of them: its segment.
+    /// Adds an arm to a decision, with its probability; returns the arm's segment.
     pub(crate) fn open_arm(&mut self, id: InstanceId, outcomes: Outcomes, share: f64) -> SegmentId {
         let parent = self.instances.get(id).map_or(0, |instance| instance.segment);
         let segment = self.branches.open(parent, id, share);
@@ -146,7 +144,7 @@ impl Graph {
         segment
     }
 
-    /// A region behind a fork: its line, and the number of the arm that it is.
+    /// Adds a region behind a fork; returns its line and the number of its arm.
     pub(crate) fn open_region(&mut self, id: InstanceId) -> (LineId, usize) {
         let line = self.lines.open(id);
         let mut arm = 0;
@@ -160,14 +158,14 @@ impl Graph {
         (line, arm)
     }
 
-    /// A fork without regions.
+    /// Notes a fork, also one without regions.
     pub(crate) fn note_fork(&mut self, id: InstanceId) {
         if let Some(line) = self.instances.get(id).map(|fork| fork.line) {
             self.forks.entry(id).or_insert_with(|| Fork { line, regions: Vec::new(), join: None });
         }
     }
 
-    /// What follows a fork when its regions have ended. `links` are the writers of predicates that several regions write.
+    /// Sets the join of a fork. `links` are the links of chains that have writers in several regions.
     pub(crate) fn join_fork(
         &mut self,
         fork: InstanceId,
@@ -188,22 +186,22 @@ impl Graph {
         }
     }
 
-    /// The writers of a predicate in the regions before a join, where several wrote it.
+    /// The links of chains that have writers in several regions before this join.
     pub(crate) fn joined(&self, join: InstanceId) -> Option<&[(Chain, Link)]> {
         self.joins.get(&join).map(Vec::as_slice)
     }
 
-    /// Whether a fork's join has not retired.
+    /// Whether the fork is known: its join has not retired.
     pub(crate) fn has_fork(&self, fork: InstanceId) -> bool {
         self.forks.contains_key(&fork)
     }
 
-    /// The join behind the region that a line is.
+    /// The join behind the region of a line.
     pub(crate) fn join_behind(&self, line: LineId) -> Option<InstanceId> {
         self.forks.get(&self.lines.fork(line)?)?.join
     }
 
-    /// The regions' place in the fork that they began at.
+    /// The fork at which the region of a line began, and the region's number.
     pub(crate) fn region(&self, line: LineId) -> Option<(InstanceId, usize)> {
         let fork = self.lines.fork(line)?;
         let place = self.forks.get(&fork)?.regions.iter().position(|region| *region == line)?;
@@ -212,7 +210,7 @@ impl Graph {
 
     // ── branches ──
 
-    /// Whether a decision on the way to a segment is not made.
+    /// Whether a decision on the way to a segment is open.
     pub(crate) fn is_speculative(&self, segment: SegmentId) -> bool {
         self.branches.is_open(segment)
     }
@@ -221,32 +219,32 @@ impl Graph {
         !self.branches.is_empty()
     }
 
-    /// The oldest decision on the way to an instance that is not made.
+    /// The oldest open decision on the way to an instance.
     pub(crate) fn undecided(&self, instance: &Instance) -> Option<InstanceId> {
         self.branches.undecided(instance.segment)
     }
 
-    /// How likely a segment is taken: 1 where it is certain.
+    /// Probability of a segment; 1 if it is certain.
     pub(crate) fn probability(&self, segment: SegmentId) -> f64 {
         self.branches.probability(segment)
     }
 
-    /// Whether no decision on the way to a segment is more likely to go another way.
+    /// Whether the segment lies on the most likely way of every open decision before it.
     pub(crate) fn is_likeliest(&self, segment: SegmentId) -> bool {
         self.branches.is_likeliest(segment)
     }
 
-    /// Whether a path of this segment may grow.
+    /// Whether a path in this segment may grow.
     pub(crate) fn is_awake(&self, segment: SegmentId) -> bool {
         self.branches.is_awake(segment)
     }
 
-    /// Lets as many branches grow, the likelier ones first.
+    /// Lets branches grow, the most likely ones first, up to `width`.
     pub(crate) fn awaken(&mut self, width: usize) {
         self.branches.awaken(width);
     }
 
-    /// Two segments are the same stretch: both certain, or one and the same.
+    /// Whether two segments are the same stretch: both certain, or the same number.
     pub(crate) fn is_same_stretch(&self, a: SegmentId, b: SegmentId) -> bool {
         a == b || !(self.is_speculative(a) || self.is_speculative(b))
     }
@@ -266,28 +264,27 @@ impl Graph {
         self.lines.next_active(after)
     }
 
-    /// The oldest instance of a line that has not retired, unless the line waits for regions.
+    /// The head of a line, unless the line waits for regions.
     pub(crate) fn head_of(&self, line: LineId) -> Option<InstanceId> {
         self.lines.head(line)
     }
 
-    /// The oldest instances of the lines that go on and wait for no region.
+    /// The heads of the lines that have begun and wait for no region.
     pub(crate) fn active_heads(&self) -> impl Iterator<Item = &Instance> {
         let lines = std::iter::successors(self.next_active_line(None), |line| self.next_active_line(Some(*line)));
         lines.filter_map(|line| self.get(self.head_of(line)?))
     }
 
-    /// The oldest instances of all lines, also of those that have not begun.
+    /// The heads of all lines, including those that have not begun.
     pub(crate) fn heads(&self) -> impl Iterator<Item = &Instance> {
         self.lines.heads().filter_map(|id| self.instances.get(id))
     }
 
-    /// Imprecise PIAs that still run although younger instances have retired, oldest first.
+    /// Detached PIAs, oldest first.
     pub(crate) fn detached(&self) -> &BTreeSet<InstanceId> {
         &self.detached
     }
 
-    /// The oldest instance of a line from now on.
     pub(crate) fn set_head(&mut self, line: LineId, head: Option<InstanceId>) {
         let head = head.and_then(|id| Some((id, self.instances.get(id)?.position)));
         self.set_head_at(line, head);
@@ -303,13 +300,13 @@ impl Graph {
         }
     }
 
-    /// A line has retired up to a position; what is next on it.
+    /// A line has retired up to a position; sets its next head.
     pub(crate) fn advance(&mut self, line: LineId, position: u64, next: Option<InstanceId>) {
         self.lines.pass(line, position);
         self.set_head(line, next);
     }
 
-    /// A fork has retired: its regions begin.
+    /// A fork has retired: begins its regions.
     pub(crate) fn begin_regions(&mut self, id: InstanceId, line: LineId, position: u64) {
         self.lines.pass(line, position);
         let Some(fork) = self.forks.get(&id) else { return };
@@ -324,7 +321,6 @@ impl Graph {
         }
     }
 
-    /// The end of a region has retired.
     pub(crate) fn end_region(&mut self, region: LineId) {
         let Some(fork) = self.lines.remove(region).and_then(|fork| self.forks.get(&fork)) else { return };
         let (line, join) = (fork.line, fork.join);
@@ -333,17 +329,17 @@ impl Graph {
         }
     }
 
-    /// How many states were entered and iterations begun on a line since a node of it was started last, up to what has retired.
+    /// Number of states entered and iterations begun on a line since the last node that was started, up to what has retired.
     pub(crate) fn idle_visits(&self, line: LineId) -> u32 {
         self.lines.idle_visits(line)
     }
 
-    /// An instance of a line has retired after so many visits; whether it was started.
+    /// An instance has retired after this number of visits; a started one resets the count.
     pub(crate) fn count_visits(&mut self, line: LineId, visits: u32, started: bool) {
         self.lines.count_visits(line, visits, started);
     }
 
-    /// An imprecise PIA that runs lets younger ones of its line begin.
+    /// Detaches a running imprecise PIA, so that younger instances may begin.
     pub(crate) fn pass_over(&mut self, id: InstanceId) {
         let Some((node, line, position, next)) = self.instances.get_mut(id).and_then(|instance| {
             let (line, position, next) = (instance.line, instance.position, instance.arms.first()?.next);
@@ -359,7 +355,7 @@ impl Graph {
         self.advance(line, position, next);
     }
 
-    /// A running PIA whose path was left: it leads nowhere, and ends as it ends.
+    /// The path of a running PIA was left: it runs to its end, and nothing follows it.
     pub(crate) fn orphan(&mut self, id: InstanceId) {
         let Some(instance) = self.instances.get_mut(id) else { return };
         instance.arms.clear();
@@ -373,7 +369,6 @@ impl Graph {
 
     // ── ending ──
 
-    /// A marker, or a node, has ended so.
     pub(crate) fn end(&mut self, id: InstanceId, ended: Ended) {
         let Some(instance) = self.instances.get_mut(id) else { return };
         match &mut instance.body {
@@ -382,7 +377,7 @@ impl Graph {
         }
     }
 
-    /// Its result is none any more: it begins, or decides, again.
+    /// Discards a result: the instance begins, or decides, again.
     pub(crate) fn reopen(&mut self, id: InstanceId) {
         let Some(instance) = self.instances.get_mut(id) else { return };
         match &mut instance.body {
@@ -395,7 +390,7 @@ impl Graph {
         }
     }
 
-    /// What a result is made of.
+    /// Sets the inputs of a result.
     pub(crate) fn set_seen(&mut self, id: InstanceId, seen: Option<Seen>) {
         let Some(instance) = self.instances.get_mut(id) else { return };
         let seen = seen.map(Box::new);
@@ -405,14 +400,14 @@ impl Graph {
         }
     }
 
-    /// Its result cannot change any more.
+    /// Marks a result as settled: it can no longer change.
     pub(crate) fn settle(&mut self, id: InstanceId) {
         if let Some(instance) = self.instances.get_mut(id) {
             instance.is_settled = true;
         }
     }
 
-    /// The world has changed from outside: no result that is not real is safe from change.
+    /// The world has changed from outside: no result is settled any more, except what is real.
     pub(crate) fn unsettle_all(&mut self) {
         self.instances.iter_mut().for_each(|instance| instance.is_settled = false);
     }
@@ -433,19 +428,19 @@ impl Graph {
         self.instances.get_mut(id)
     }
 
-    /// How urgent an instance is, for [`crate::window::dispatch`].
+    /// The urgency of an instance, for [`crate::window::dispatch`].
     pub(crate) fn dispatching(&mut self, id: InstanceId) -> Option<&mut DispatchCell> {
         self.instances.get_mut(id).map(|instance| &mut instance.dispatch)
     }
 
-    /// What an instance waits for and who waits for it, for [`crate::window::waits`].
+    /// The wait of an instance and its waiters, for [`crate::window::waits`].
     pub(crate) fn waiting(&mut self, id: InstanceId) -> Option<&mut WaitCell> {
         self.instances.get_mut(id).map(|instance| &mut instance.waiting)
     }
 
     // ── invariants ──
 
-    /// What is wrong with the graph, if anything: links lead both ways, everybody can be reached, heads are what they say.
+    /// Checks the graph: links lead both ways, every instance can be reached, heads are where they should be.
     pub(crate) fn check_invariants(&self) -> Result<(), String> {
         self.branches.check_invariants(|id| self.contains(id))?;
         let mut reached: BTreeSet<InstanceId> = self.detached.clone();
@@ -468,7 +463,7 @@ impl Graph {
                 let Some(next) = arm.next else { continue };
                 let Some(next) = self.get(next) else {
                     if instance.is_detached() {
-                        // What follows it on its line may have retired before it.
+                        // The instance that follows it on its line may have retired before it.
                         continue;
                     }
                     return Err(format!("{} is followed by {next}, which is not in the window", instance.id));

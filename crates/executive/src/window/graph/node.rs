@@ -1,4 +1,4 @@
-//! The life of a node: the changes of its status, each with what the status owns.
+//! The life of a node: every change of its status, with the data that the status owns.
 
 use super::Graph;
 use super::instance::{Body, Held, Instance, Node, Status};
@@ -20,14 +20,14 @@ impl Graph {
         self.get(id).and_then(Instance::node)
     }
 
-    /// It has asked for its resources.
+    /// Acquiring: the node has asked for its resources.
     pub(crate) fn acquire(&mut self, id: InstanceId, priority: i64) {
         if let Some(node) = self.node_mut(id) {
             node.status = Status::Acquiring { priority };
         }
     }
 
-    /// It has its resources, or needs none.
+    /// Granted: the node has its resources, or needs none.
     pub(crate) fn grant(&mut self, id: InstanceId, lease: Option<Lease>, now: Timestamp) {
         if let Some(node) = self.node_mut(id) {
             let lease = lease.map(Box::new);
@@ -35,7 +35,7 @@ impl Graph {
         }
     }
 
-    /// It waits for its projection.
+    /// Projecting: the node waits for its projection.
     pub(crate) fn project(&mut self, id: InstanceId) {
         if let Some(node) = self.node_mut(id) {
             let held = node.status.take_held();
@@ -43,7 +43,6 @@ impl Graph {
         }
     }
 
-    /// It has its projection.
     pub(crate) fn projected(&mut self, id: InstanceId, projection: ProjectionId) {
         if let Some(node) = self.node_mut(id) {
             let held = node.status.take_held();
@@ -51,7 +50,7 @@ impl Graph {
         }
     }
 
-    /// Its goal is under way.
+    /// Running: the goal is under way.
     pub(crate) fn run(&mut self, id: InstanceId) {
         if let Some(node) = self.node_mut(id) {
             let held = node.status.take_held();
@@ -59,7 +58,7 @@ impl Graph {
         }
     }
 
-    /// What it contains is under way; the lease is the interpreter's from now on.
+    /// Running, for a routine: its parts are under way; from now on the interpreter owns the lease.
     pub(crate) fn run_routine(&mut self, id: InstanceId, interpreter: Box<Interpreter>) {
         if let Some(node) = self.node_mut(id) {
             let since = node.status.since().unwrap_or_default();
@@ -75,7 +74,7 @@ impl Graph {
         }
     }
 
-    /// A routine has ended, or is ended: its interpreter. What it held is still to be given back.
+    /// Takes the interpreter of a routine that ends. Its lease is still to be given back.
     pub(crate) fn end_routine(&mut self, id: InstanceId) -> Option<Box<Interpreter>> {
         let node = self.node_mut(id)?;
         match std::mem::replace(&mut node.status, Status::Expanded) {
@@ -91,19 +90,19 @@ impl Graph {
         }
     }
 
-    /// What it held, which it does not hold any more.
+    /// Takes what the node holds.
     pub(crate) fn take_held(&mut self, id: InstanceId) -> Held {
         self.node_mut(id).map(|node| node.status.take_held()).unwrap_or_default()
     }
 
-    /// Its result is a better one, of which nobody has used what is otherwise.
+    /// Replaces the result by a better one; nobody has used the outputs that differ.
     pub(crate) fn improve(&mut self, id: InstanceId, outputs: Outputs) {
         if let Some(Node { status: Status::Finished(ended), .. }) = self.node_mut(id) {
             ended.outputs = outputs;
         }
     }
 
-    /// It begins again, as another attempt; what it was made of stays known.
+    /// The node begins again, as a new attempt; the facts of its earlier result stay known.
     pub(crate) fn begin_again(&mut self, id: InstanceId) {
         if let Some(node) = self.node_mut(id) {
             node.status = Status::Expanded;
@@ -111,7 +110,7 @@ impl Graph {
         }
     }
 
-    /// It is tried again, not before a moment.
+    /// The node is tried again, not before a given time.
     pub(crate) fn try_again(&mut self, id: InstanceId, not_before: Timestamp) {
         self.begin_again(id);
         if let Some(node) = self.node_mut(id) {
@@ -120,16 +119,16 @@ impl Graph {
         }
     }
 
-    /// Its tries begin again: it is made of something else now.
+    /// The count of tries begins again, because the inputs have changed.
     pub(crate) fn forget_tries(&mut self, id: InstanceId) {
         if let Some(node) = self.node_mut(id) {
             node.tries = 1;
-            // Of what only a prediction made of it nobody else knows.
+            // Only this instance has crashed on the mispredicted inputs.
             node.crashes = 0;
         }
     }
 
-    /// Its worker died once more: how often by now.
+    /// Counts a crash; returns the number of crashes so far.
     pub(crate) fn count_crash(&mut self, id: InstanceId) -> u32 {
         self.node_mut(id).map_or(0, |node| {
             node.crashes += 1;
@@ -137,7 +136,7 @@ impl Graph {
         })
     }
 
-    /// Whether its goal was under way when it ended.
+    /// Stores whether the goal was under way when the node ended.
     pub(crate) fn set_acted(&mut self, id: InstanceId, has_acted: bool) {
         if let Some(node) = self.node_mut(id) {
             node.has_acted = has_acted;
@@ -146,7 +145,7 @@ impl Graph {
 }
 
 impl Status {
-    /// What it held; the status is to be replaced.
+    /// Takes what the node holds; the caller replaces the status.
     fn take_held(&mut self) -> Held {
         match self {
             Status::Granted(held) | Status::Projecting(held) | Status::Running(held) => std::mem::take(held),

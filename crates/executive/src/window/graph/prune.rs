@@ -6,25 +6,26 @@ use ratn_model::id::InstanceId;
 use smallvec::smallvec;
 use std::collections::BTreeSet;
 
-/// What a path that is not taken takes with it. The instances are still in the graph: whoever discards them ends first what they do.
+/// Everything that is lost with a path that is not taken. The instances are still in the graph, so that their work can be stopped
+/// first.
 #[derive(Debug, Default)]
 pub(crate) struct Pruned {
     /// Oldest first.
     pub(crate) instances: BTreeSet<InstanceId>,
     pub(crate) segments: BTreeSet<SegmentId>,
     pub(crate) lines: BTreeSet<LineId>,
-    /// Ends of regions that are lost although their fork is not.
+    /// Lost ends of regions, with their fork, which stays.
     pub(crate) region_ends: Vec<(InstanceId, InstanceId)>,
-    /// Forks whose join is lost although they are not.
+    /// Forks that stay, but whose join is lost.
     pub(crate) without_join: Vec<InstanceId>,
-    /// Nothing that follows this instance is left, and nothing may grow there.
+    /// The instance behind which nothing is left and nothing may grow.
     pub(crate) behind: Option<InstanceId>,
-    /// Nothing may grow on this line as it did.
+    /// The line on which nothing may go on growing as before.
     pub(crate) stopped_line: Option<LineId>,
 }
 
 impl Graph {
-    /// A decision is made: the other arms are lost. With what has become certain.
+    /// Takes an arm of a decision; the others are lost. Also returns what has become certain.
     pub(crate) fn take_arm(&mut self, id: InstanceId, taken: usize) -> (Pruned, Vec<InstanceId>) {
         let Some(instance) = self.instances.get_mut(id).filter(|instance| instance.arms.len() > taken) else {
             return Default::default();
@@ -48,7 +49,7 @@ impl Graph {
         pruned.segments = arms.iter().map(|arm| arm.segment).filter(|segment| *segment != own).collect();
         let mut next: Vec<InstanceId> = arms.iter().filter_map(|arm| arm.next).collect();
         if is_detached {
-            // Its line went on without it: what has not retired is behind it.
+            // The line has passed it: everything that has not retired is behind it.
             pruned.lines = self.stop_line(line, &mut next);
             pruned.stopped_line = Some(line);
             let beside = self.detached.iter().filter_map(|id| self.instances.get(*id));
@@ -61,7 +62,7 @@ impl Graph {
         pruned
     }
 
-    /// Adds to `heads` what a line has come to, also in the regions that it waits for, and waits for them no more: their lines.
+    /// Stops a line: adds its head to `heads`, and those of the regions that it waits for. Returns the lines of these regions.
     fn stop_line(&mut self, line: LineId, heads: &mut Vec<InstanceId>) -> BTreeSet<LineId> {
         let mut regions = BTreeSet::new();
         let mut open = vec![line];
@@ -77,7 +78,7 @@ impl Graph {
         regions
     }
 
-    /// Follows the arms from these instances, and from segments that are lost.
+    /// Collects what is lost, along the arms from these instances and behind lost segments.
     fn prune(&mut self, from: Vec<InstanceId>, pruned: &mut Pruned) {
         let mut open = from;
         loop {
@@ -113,7 +114,7 @@ impl Graph {
                     _ => {}
                 }
             }
-            // Segments below a lost one are lost, and so is what stands on them.
+            // Segments behind a lost segment are lost, with their instances.
             let behind = self.branches.behind(&pruned.segments, &pruned.instances);
             if behind.is_empty() {
                 break;

@@ -1,4 +1,4 @@
-//! One more instance behind the last one of a path, and what is seen from behind it: its outputs, what it assigns, its effects.
+//! Appends one instance to a path and updates the environment behind it: its outputs, its assignments, its effects.
 
 use super::Growth;
 use super::environment::{Binding, Environment, Link, Producer};
@@ -20,7 +20,7 @@ use smallvec::SmallVec;
 use std::borrow::Cow;
 use std::sync::Arc;
 
-/// What is appended: a node, or a marker that leaves its state by an outcome.
+/// What to append: a node, or a marker that leaves its state by an outcome.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum What {
     Node,
@@ -102,7 +102,7 @@ impl Growth {
         id
     }
 
-    /// The environment behind an instance that ends by an outcome.
+    /// The environment behind an instance that ends with a given outcome.
     pub(super) fn come_after(
         &mut self,
         graph: &Graph,
@@ -126,7 +126,7 @@ impl Growth {
         self.produce(context, index, producer, state, link.outcome);
     }
 
-    /// Its outputs and what it assigns are seen from here on.
+    /// Makes its outputs and assignments visible behind it.
     pub(super) fn produce(
         &mut self,
         context: &Context<'_>,
@@ -153,7 +153,7 @@ impl Growth {
     }
 }
 
-/// What is known where an instance is expanded, and never changes: loop variables and constants.
+/// The scope of what is known when an instance is expanded, and never changes: loop variables and constants.
 struct Fixed<'a> {
     environment: &'a Environment,
     program: &'a Program,

@@ -1,6 +1,6 @@
-//! Ways that a decision can take: an arm, a segment and a cursor for each, the likeliest first.
+//! Expands the ways on from a decision: an arm, a segment and a cursor for each, the most likely first.
 //!
-//! What follows the same condition on both arms is expanded twice: they are two futures.
+//! States behind a condition are expanded once for each arm, because these are two possible futures.
 
 use super::Growth;
 use super::cursor::{Cursor, Todo};
@@ -13,13 +13,13 @@ use ratn_model::program::{ABORTED, PREEMPTED, Program, StateKind, VIOLATED};
 use ratn_model::wait::TIMEOUT;
 use std::sync::Arc;
 
-/// How likely a connected failure is beside an outcome that is none, unless it was learned.
+/// Probability of a handled failure relative to another outcome, unless it was learned.
 const FAILURE: f64 = 0.1;
-/// No outcome counts as less likely than this, whatever was learned.
+/// Lower limit of an outcome's probability, whatever was learned.
 const LEAST_SHARE: f64 = 0.01;
 
 impl Growth {
-    /// Both lists of a condition, from where it stands.
+    /// Expands both lists of a condition.
     pub(super) fn branch_on_condition(
         &mut self,
         graph: &mut Graph,
@@ -40,7 +40,7 @@ impl Growth {
         }
     }
 
-    /// Another iteration of a `while`, and its end, from where its test stands.
+    /// Expands another iteration of a `while`, and its end, behind its test.
     pub(super) fn branch_on_test(
         &mut self,
         graph: &mut Graph,
@@ -67,7 +67,7 @@ impl Growth {
         }
     }
 
-    /// The arms of a node: one per target of the outcomes that are computed ahead.
+    /// Expands the arms of a node: one per target of the outcomes that are computed ahead.
     pub(super) fn branch_by_outcome(
         &mut self,
         graph: &mut Graph,
@@ -99,7 +99,7 @@ impl Growth {
         }
     }
 
-    /// One cursor per way on, in their order, each on a segment of its own; cursors with the outcomes that they stand for.
+    /// Replaces a cursor by one per way on, each on a segment of its own, with the outcomes that it stands for.
     fn branch(
         &mut self,
         graph: &mut Graph,

@@ -5,13 +5,13 @@ use super::environment::{Collector, Restored};
 use crate::checkpoint::Broken;
 
 impl Growth {
-    /// What its cursors share.
+    /// Collects what its cursors share.
     pub(crate) fn collect<'a>(&'a self, places: &mut Collector<'a>) {
         self.cursors.iter().for_each(|cursor| places.add(&cursor.environment));
         self.regions.values().for_each(|regions| regions.collect(places));
     }
 
-    /// Gives its cursors back what they shared.
+    /// Restores the environments and producers of its cursors.
     pub(crate) fn restore(&mut self, places: &mut Restored) -> Result<(), Broken> {
         for cursor in &mut self.cursors {
             cursor.environment = places.environment()?;

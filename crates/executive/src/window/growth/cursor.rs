@@ -1,4 +1,5 @@
-//! Cursors, the places where the window grows: one per open end of a path. It holds the environment of the next instance.
+//! Cursors: the places where the window grows, one per open end of a path. A cursor holds the environment of the next
+//! instance.
 
 use super::environment::Environment;
 use crate::plan::Outcome;
@@ -12,25 +13,25 @@ use std::sync::Arc;
 pub(super) struct Cursor {
     #[serde(skip)]
     pub(super) environment: Environment,
-    /// The youngest instance on its path and the arm of it that it follows; may have retired since.
+    /// The youngest instance on its path, and its arm that the cursor follows; the instance may have retired.
     pub(super) tail: Option<(InstanceId, usize)>,
     pub(super) line: LineId,
     pub(super) segment: SegmentId,
-    /// How many instances of its line are before it.
+    /// Number of instances before it on its line.
     pub(super) position: u64,
     pub(super) todo: Todo,
-    /// Why it left by an outcome that is not success.
+    /// Reason why the path left by an outcome that is not success.
     pub(super) because: Option<Arc<str>>,
-    /// States entered and iterations begun since the last instance.
+    /// Number of states entered and iterations begun since the last instance.
     pub(super) visits: u32,
-    /// And since the last node.
+    /// The same since the last node.
     pub(super) idle_visits: u32,
-    /// Cursors grow in this order.
+    /// Cursors with smaller numbers grow first.
     pub(super) order: u64,
 }
 
 impl Cursor {
-    /// A state is entered or an iteration begun.
+    /// Counts a state entered or an iteration begun.
     pub(super) fn count_visit(&mut self) {
         self.visits += 1;
         self.idle_visits += 1;
@@ -42,13 +43,13 @@ impl Cursor {
 pub(super) enum Todo {
     /// Visit a state.
     Enter(StateId),
-    /// A state has ended: follow the outcome.
+    /// A state has ended with this outcome: follow it.
     Leave(StateId, Outcome),
-    /// The lists of a composite state have ended: what it does when it is left. Of its variables, those before it stay.
+    /// The lists of a composite state have ended: append its exit. The first `variables` variables stay in scope.
     Exit { state: StateId, visit: u32, outcome: Outcome, variables: usize },
     /// The next iteration of the innermost loop, or its end.
     Iterate,
-    /// Waits for the list of a loop, or for the regions of a fork.
+    /// Wait for the list of a loop, or for the regions of a fork.
     Await(InstanceId),
     /// The path ends.
     Done,

@@ -1,6 +1,6 @@
-//! What is fixed about a place of the program when the window grows there: where it stands in the tree of states, what its
-//! variables are, which older instance wrote each port last (register renaming), and which older instances write each
-//! predicate (memory renaming). Copies share everything.
+//! What is fixed about a place of the program when the window grows there: its place in the tree of states, its variables,
+//! the last writer of each port (register renaming), and the older writers of each predicate (memory renaming). Copies
+//! share their data.
 
 mod checkpoint;
 
@@ -22,38 +22,38 @@ use std::sync::{Arc, OnceLock};
 pub(crate) struct Environment {
     pub(crate) frames: Option<Arc<Frame>>,
     pub(crate) variables: Variables,
-    /// By chain, the youngest older instance that stands in it.
+    /// By chain, its youngest writer before this place.
     pub(crate) writers: Table<Link>,
-    /// Of the test of a `while`: its iteration, which is not begun yet.
+    /// For the test of a `while`: the iteration that it decides on, which has not begun yet.
     pub(crate) test: Option<Box<(StateId, Iteration)>>,
-    /// By state, who wrote its outputs last; at the number of states plus its own, how a region ended.
+    /// By state, the last writer of its outputs; at the number of states plus its own number, the outcome of a region.
     pub(crate) producers: Table<Arc<Producer>>,
 }
 
-/// An instance as a writer, seen along one of its arms. Its own environment has the link to the next older one.
+/// A writer in a chain, seen along one of its arms. The writer's own environment links to the next older one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Link {
     pub(crate) writer: InstanceId,
     /// The outcome that the path assumes.
     pub(crate) outcome: Outcome,
-    /// The arm's outcomes do not all change the same.
+    /// The outcomes of the arm have different effects.
     pub(crate) vague: bool,
 }
 
-/// An instance as the writer of outputs. They stand here once it has retired, for as long as somebody can name them.
+/// The writer of outputs. Its outputs stay here after it has retired, as long as an expression can refer to them.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Producer {
     #[serde(skip)]
     pub(crate) instance: InstanceId,
     #[serde(skip)]
     pub(crate) real: OnceLock<Outputs>,
-    /// The better ones that came after that, once somebody begins who uses them.
+    /// Later improved outputs, once an instance that uses them begins.
     #[serde(skip)]
     pub(crate) better: OnceLock<Outputs>,
 }
 
 impl Producer {
-    /// An instance that has not retired.
+    /// The producer for an instance that has not retired.
     pub(crate) fn new(instance: InstanceId) -> Producer {
         Producer { instance, real: OnceLock::new(), better: OnceLock::new() }
     }
@@ -68,47 +68,47 @@ impl Producer {
 #[derive(Debug, Clone)]
 pub(crate) struct Frame {
     pub(crate) below: Option<Arc<Frame>>,
-    /// The state whose list it is, and its visit number.
+    /// The state that owns the list, and its visit number.
     pub(crate) owner: StateId,
     pub(crate) visit: u32,
     /// Path of the owner, without the iteration.
     pub(crate) path: Arc<str>,
-    /// How often states were visited, where that may be more than once.
+    /// Number of visits of each state that can be visited several times.
     pub(crate) visits: Vec<(StateId, u32)>,
-    /// Of a loop.
+    /// In a loop: its iteration.
     pub(crate) iteration: Option<Iteration>,
-    /// Variables that there were before the owner was entered.
+    /// Number of variables before the owner was entered.
     pub(crate) variables: usize,
-    /// Of a region: the fork.
+    /// In a region: its fork.
     pub(crate) fork: Option<InstanceId>,
-    /// Of the body of a loop: the states whose outputs are those of the iteration before.
+    /// In the body of a loop: the states whose outputs are still those of the iteration before.
     pub(crate) earlier: Vec<StateId>,
 }
 
-/// Which iteration of a loop.
+/// An iteration of a loop.
 #[derive(Debug, Clone)]
 pub(crate) struct Iteration {
     pub(crate) index: usize,
-    /// The elements; none of a `while`.
+    /// The elements; `None` in a `while`.
     pub(crate) elements: Option<Arc<List>>,
 }
 
-/// Variables in sight, the innermost last. Copying is cheap.
+/// The variables in scope, the innermost last. Copying is cheap.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Variables(Arc<Vec<(Arc<str>, Binding)>>);
 
-/// What a variable is.
+/// The value or source of a variable.
 #[derive(Debug, Clone)]
 pub(crate) enum Binding {
     Known(Value),
-    /// What an instance assigns: its output port of the name [`assigned`].
+    /// The value that an instance assigns: its output port [`assigned`].
     Assigned(Arc<Producer>),
 }
 
-/// Output ports that begin so are no ports: no port is called so.
+/// First character of ports with assigned values; no declared port begins with it.
 pub(crate) const ASSIGNED: char = '$';
 
-/// The output port under which an instance keeps what it assigns to a variable.
+/// The output port in which an instance keeps the value that it assigns to a variable.
 pub(crate) fn assigned(variable: &str) -> String {
     format!("{ASSIGNED}{variable}")
 }
@@ -126,7 +126,7 @@ impl Variables {
         Arc::make_mut(&mut self.0).push((Arc::from(name), binding));
     }
 
-    /// Gives the innermost variable of a name another value.
+    /// Binds the innermost variable of a name anew.
     pub(crate) fn assign(&mut self, name: &str, binding: Binding) {
         if let Some(slot) = Arc::make_mut(&mut self.0).iter_mut().rev().find(|(n, _)| &**n == name) {
             slot.1 = binding;
@@ -155,7 +155,7 @@ impl Environment {
         }
     }
 
-    /// The loop variables in sight, innermost first: name and value.
+    /// The loop variables in scope, innermost first: name and value.
     pub(crate) fn loop_variables<'a>(
         &'a self,
         program: &'a Program,
@@ -195,7 +195,7 @@ impl Environment {
         path
     }
 
-    /// The path of a state visited here, part by part.
+    /// The same path, part by part.
     pub(crate) fn path_parts(&self, name: &str, visit: u32, iteration: Option<usize>, mut part: impl FnMut(&str)) {
         let prefix = self.frames.as_ref().map_or("", |frame| &*frame.path);
         part(prefix);
@@ -221,7 +221,8 @@ fn number(before: &str, number: usize, after: &str, part: &mut impl FnMut(&str))
     part(after);
 }
 
-/// The digits of a number; formatting by the standard library takes several times as long, and paths are made per instance.
+/// The decimal digits of a number. The standard library's formatting takes several times as long, and every instance has a
+/// path.
 fn decimal(mut number: usize, part: &mut impl FnMut(&str)) {
     let mut digits = [b'0'; 20];
     let mut at = digits.len();

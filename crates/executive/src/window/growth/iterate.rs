@@ -1,4 +1,4 @@
-//! Loops: their iterations are appended one behind the other, as far as the list is known or a test is decided or predicted.
+//! Loops: appends iterations one behind the other, as far as the list is known or a test is decided or predicted.
 
 use super::Growth;
 use super::append::What;
@@ -13,7 +13,7 @@ use ratn_model::program::{Program, StateKind};
 use std::sync::Arc;
 
 impl Growth {
-    /// The list of a loop is known: its iterations begin.
+    /// The list of a loop is known: begins its iterations.
     pub(crate) fn unroll(&mut self, graph: &Graph, context: &Context<'_>, waits_for: InstanceId, elements: List) {
         let Some(index) = self.cursors.iter().position(|cursor| cursor.todo == Todo::Await(waits_for)) else { return };
         let Some(instance) = graph.get(waits_for) else { return };
@@ -27,7 +27,7 @@ impl Growth {
         cursor.todo = Todo::Iterate;
     }
 
-    /// The innermost loop goes on to its next iteration, or ends.
+    /// Goes on to the next iteration of the innermost loop, or to its end.
     pub(super) fn iterate(&mut self, graph: &mut Graph, context: &mut Context<'_>, index: usize) {
         let program = context.program;
         let Some(frame) = self.top_frame(index) else { return };
@@ -42,7 +42,7 @@ impl Growth {
             Some(true) => self.leave_frame(index, 0),
             None => {
                 let state = program.state(owner);
-                // The test stands where the loop stands, not in its body.
+                // The test has the place of the loop, not a place in its body.
                 let environment = &mut self.cursors[index].environment;
                 environment.variables.truncate(base);
                 let inside = environment.frames.clone();
@@ -55,7 +55,7 @@ impl Growth {
         }
     }
 
-    /// The first state of the innermost loop's body is next.
+    /// Continues with the first state of the innermost loop's body.
     pub(super) fn begin_iteration(&mut self, index: usize, program: &Program) {
         let Some(frame) = &self.cursors[index].environment.frames else { return };
         let body = match &program.state(frame.owner).kind {
@@ -69,7 +69,7 @@ impl Growth {
         self.note_earlier(index, program.list_of(owner));
     }
 
-    /// An iteration begins: what the states of its body have written is of the one before.
+    /// An iteration begins: notes that the outputs of the body's states are those of the iteration before.
     pub(super) fn note_earlier(&mut self, index: usize, body: &[StateId]) {
         let environment = &self.cursors[index].environment;
         let earlier: Vec<StateId> = body.iter().copied().filter(|id| environment.producer(*id).is_some()).collect();
@@ -81,8 +81,8 @@ impl Growth {
         }
     }
 
-    /// What an iteration has passed over on its way to a state of the body, or to its end, gives nothing in it. What comes only later is still that
-    /// of the iteration before.
+    /// Removes old outputs of body states that this iteration has passed over on its way to `to`, or to its end. Outputs of states that may still
+    /// come stay those of the iteration before.
     pub(super) fn forget_passed_over(&mut self, program: &Program, index: usize, to: Option<StateId>) {
         let Some(frame) = self.cursors[index].environment.frames.as_ref() else { return };
         if frame.earlier.is_empty() {
@@ -99,7 +99,7 @@ impl Growth {
         }
     }
 
-    /// A state has written its outputs: they are of this iteration.
+    /// A state has written its outputs in this iteration.
     pub(super) fn is_of_now(&mut self, index: usize, id: StateId) {
         let frames = self.cursors[index].environment.frames.as_ref();
         if frames.is_some_and(|frame| frame.earlier.contains(&id))

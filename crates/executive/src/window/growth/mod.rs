@@ -1,15 +1,15 @@
-//! Growing the window: cursors walk the program along its transitions and append instances, until the horizon.
+//! Growing the window: cursors follow the program's transitions and append instances, up to the horizon.
 //!
-//! It owns the cursors. It reads the graph for what is certain and how far its lines have retired, and appends to it; it knows
-//! nothing of results but the lists of loops, which it is told.
+//! It owns the cursors. It reads in the graph which paths are certain and how far lines have retired, and appends to the
+//! graph. It knows no results except the lists of loops, which are passed to it.
 //!
 //! | | |
 //! |---|---|
 //! | `cursor` | an open end of a path |
 //! | `walk` | entering, leaving and following states |
-//! | `append` | one more instance, and what is seen from behind it |
+//! | `append` | one more instance, and the environment behind it |
 //! | `iterate` | iterations of loops |
-//! | `branch` | several ways on |
+//! | `branch` | several ways on from a decision |
 //! | `regions` | forks and joins |
 //! | `environment`, `table` | what is fixed about a place: variables, ports, writers of facts |
 
@@ -40,18 +40,18 @@ use std::sync::Arc;
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Growth {
     cursors: Vec<Cursor>,
-    /// By fork, what is known of the ends of its regions.
+    /// By fork, the known ends of its regions.
     regions: BTreeMap<InstanceId, Regions>,
-    /// How likely the outcomes of decisions are, by the path of the state.
+    /// Learned probabilities of outcomes, by the path of the state.
     learned_outcomes: BTreeMap<String, BTreeMap<String, f64>>,
     speculation_width: usize,
     horizon: u64,
     last_order: u64,
-    /// Instances appended since this was asked last.
+    /// Number of instances appended since the last `forget_grown`.
     grown: usize,
 }
 
-/// Where a path goes on that was left.
+/// Where a path continues that was left.
 pub(crate) struct Departure {
     pub(crate) environment: Environment,
     pub(crate) line: u64,
@@ -96,7 +96,7 @@ impl Growth {
         }
     }
 
-    /// Grows at every cursor that may; whether anything came of it.
+    /// Grows at every cursor that may grow; true if anything was appended.
     pub(crate) fn grow(&mut self, graph: &mut Graph, context: &mut Context<'_>) -> bool {
         let mut grew = false;
         'again: loop {
@@ -128,7 +128,7 @@ impl Growth {
         }
     }
 
-    /// Most of the time there is one cursor, and nothing to choose.
+    /// The common case of a single cursor, where there is nothing to choose.
     fn grow_alone(&mut self, graph: &mut Graph, context: &mut Context<'_>) -> bool {
         let mut grew = false;
         while self.cursors.len() == 1 && !graph.has_branches() && self.may_grow(graph, 0) {
@@ -166,17 +166,17 @@ impl Growth {
         self.last_order
     }
 
-    /// How many instances were appended since this was asked last, if they are more than a share of the window.
+    /// Number of instances appended since the last `forget_grown`.
     pub(crate) fn grown(&self) -> usize {
         self.grown
     }
 
-    /// The growth so far has been taken into account.
+    /// Resets that number.
     pub(crate) fn forget_grown(&mut self) {
         self.grown = 0;
     }
 
-    /// An instance ended otherwise than was computed ahead: its path goes on where its outcome leads.
+    /// An instance ended otherwise than computed ahead: continues its path where its outcome leads.
     pub(crate) fn depart(
         &mut self,
         context: &Context<'_>,
@@ -202,7 +202,7 @@ impl Growth {
         self.produce(context, index, producer, state, outcome);
     }
 
-    /// An instance decides again: the paths behind it are expanded anew.
+    /// An instance decides again: expands the paths behind it again.
     pub(crate) fn reopen(&mut self, graph: &mut Graph, context: &Context<'_>, id: InstanceId) {
         let Some(instance) = graph.get(id) else { return };
         let (line, segment, position) = (instance.line, instance.segment, instance.position);
@@ -234,7 +234,7 @@ impl Growth {
         }
     }
 
-    /// Paths that are lost do not grow any more.
+    /// Removes the cursors of lost paths.
     pub(crate) fn prune(&mut self, graph: &Graph, pruned: &Pruned) {
         let behind = pruned.behind;
         self.cursors.retain(|cursor| {
@@ -249,7 +249,7 @@ impl Growth {
         self.prune_regions(graph, pruned);
     }
 
-    /// Only one way on from a decision is left.
+    /// A decision is made: only one way on is left.
     pub(crate) fn arm_taken(&mut self, id: InstanceId) {
         for cursor in &mut self.cursors {
             if let Some((tail, arm)) = &mut cursor.tail
@@ -260,13 +260,13 @@ impl Growth {
         }
     }
 
-    /// The run ends: nothing grows any more.
+    /// The run ends: stops growing.
     pub(crate) fn stop(&mut self) {
         self.cursors.clear();
         self.regions.clear();
     }
 
-    /// What is wrong with the cursors, if anything.
+    /// Checks the cursors.
     pub(crate) fn check_invariants(&self, graph: &Graph) -> Result<(), String> {
         for cursor in &self.cursors {
             if let Todo::Await(id) = cursor.todo

@@ -17,32 +17,32 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Where a path of a region ends, and what is seen from there.
+/// The end of one path of a region, with the environment there.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct RegionExit {
     end: InstanceId,
     #[serde(skip)]
     environment: Environment,
     producer: Arc<Producer>,
-    /// Why the path left otherwise than by success.
+    /// Reason why the path left by an outcome that is not success.
     because: Option<Arc<str>>,
 }
 
-/// A fork that is not joined for good: its join may be lost with an end of a region, and is expanded anew.
+/// A fork whose join may still be lost with an end of a region, and is then expanded again.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Regions {
     /// The concurrency and its visit.
     state: StateId,
     visit: u32,
-    /// Per region, its ends: one per path.
+    /// By region, the ends of its paths.
     ends: Vec<Vec<RegionExit>>,
     is_joined: bool,
-    /// What goes on behind the join.
+    /// The cursor that goes on behind the join.
     waiting: Cursor,
 }
 
 impl Growth {
-    /// A concurrency is entered: every region begins.
+    /// Enters a concurrency: begins every region.
     pub(super) fn fork(
         &mut self,
         graph: &mut Graph,
@@ -106,7 +106,7 @@ impl Growth {
         }
     }
 
-    /// Forks whose regions have each come to one end that nothing in the region can change: what follows the join is expanded.
+    /// Expands the join of each fork whose regions have one end each, which nothing inside of the region can change.
     pub(super) fn join_regions(&mut self, graph: &mut Graph, context: &mut Context<'_>) {
         let is_single = |regions: &Regions, ends: &Vec<RegionExit>| match ends.as_slice() {
             [exit] => graph.get(exit.end).is_none_or(|end| graph.is_same_stretch(end.segment, regions.waiting.segment)),
@@ -169,17 +169,17 @@ impl Growth {
         }
         let several = merged.into_iter().filter(|(_, links)| links.len() > 1);
         let links: Vec<_> = several.flat_map(|(p, links)| links.into_iter().map(move |link| (p, link))).collect();
-        // The decider sees what the regions wrote.
+        // The decider sees the outputs of the regions.
         graph.join_fork(id, join, self.cursors[index].environment.clone(), links);
         self.cursors[index].todo = Todo::Await(join);
     }
 
-    /// Where the concurrency of a fork stands.
+    /// The environment of a fork's concurrency.
     pub(crate) fn around(&self, fork: InstanceId) -> Option<&Environment> {
         self.regions.get(&fork).map(|regions| &regions.waiting.environment)
     }
 
-    /// A join has decided: the concurrency is left by an outcome.
+    /// A join has decided: leaves the concurrency by an outcome.
     pub(crate) fn leave_join(&mut self, graph: &Graph, join: InstanceId, outcome: usize, because: Option<Arc<str>>) {
         let Some(instance) = graph.get(join) else { return };
         let (state, visit) = (instance.state, instance.visit);
@@ -190,7 +190,7 @@ impl Growth {
         }
     }
 
-    /// What is known of the regions of lost forks and joins goes with them; where only a join is lost, its fork waits again.
+    /// Removes the regions of lost forks; a fork that has lost only its join or an end of a region waits again.
     pub(super) fn prune_regions(&mut self, graph: &Graph, pruned: &Pruned) {
         for (fork, end) in &pruned.region_ends {
             if let Some(regions) = self.regions.get_mut(fork) {
@@ -209,13 +209,13 @@ impl Growth {
         self.forget_joined(graph);
     }
 
-    /// Forks whose join has retired need not be kept in mind.
+    /// Removes forks whose join has retired.
     pub(crate) fn forget_joined(&mut self, graph: &Graph) {
         self.regions.retain(|fork, _| graph.has_fork(*fork));
     }
 }
 
-/// Of a checkpoint: what the ends of regions share.
+/// For a checkpoint: the environments of the ends of regions.
 impl Regions {
     pub(super) fn collect<'a>(&'a self, places: &mut Collector<'a>) {
         places.add(&self.waiting.environment);

@@ -1,7 +1,7 @@
-//! A table that can be copied in constant time and changed in a time that depends on its size only by the logarithm.
+//! A persistent table: copied in constant time, changed in time logarithmic in its size.
 //!
-//! A radix tree over small numbers (states, predicates) with structure shared between copies: every instance keeps the
-//! tables of its place in the program, and neighbours share all but what changed between them.
+//! A radix tree over small numbers (states, predicates) whose copies share structure. Every instance keeps the tables
+//! of its place in the program, and neighbours share all nodes that did not change between them.
 
 mod checkpoint;
 
@@ -40,7 +40,6 @@ impl<T: Clone> Table<T> {
         Table { depth, root: None }
     }
 
-    /// The value at an index.
     pub(crate) fn get(&self, index: usize) -> Option<&T> {
         let mut node = self.root.as_deref()?;
         let mut level = self.depth;
@@ -53,7 +52,6 @@ impl<T: Clone> Table<T> {
         }
     }
 
-    /// Puts a value at an index, or takes it away.
     pub(crate) fn set(&mut self, index: usize, value: Option<T>) {
         set(&mut self.root, self.depth, index, value);
     }

@@ -1,4 +1,4 @@
-//! Walking the program: a cursor enters a state, leaves it by an outcome, and follows where that leads.
+//! Walking the program: a cursor enters a state, leaves it by an outcome, and follows that outcome's target.
 
 use super::Growth;
 use super::append::What;
@@ -66,10 +66,10 @@ impl Growth {
                 self.cursors[index].todo = Todo::Await(instance);
             }
             StateKind::While { body_first, .. } => {
-                // Iterating counts on from here.
+                // The first iteration counts on from here.
                 let before = if *body_first { 0 } else { usize::MAX };
                 let iteration = Iteration { index: before, elements: None };
-                // Its scoped variables are there in every iteration.
+                // Scoped variables of the loop exist in every iteration.
                 let inside = base + state.variables.len();
                 let frame = self.frame(index, id, visit, path, inside, Some(iteration));
                 self.cursors[index].environment.frames = Some(frame);
@@ -191,7 +191,7 @@ impl Growth {
         self.leave_frame(index, outcome);
     }
 
-    /// The innermost list has ended by an outcome of its owner.
+    /// Leaves the innermost list, and its owner by this outcome.
     pub(super) fn leave_frame(&mut self, index: usize, outcome: Outcome) {
         let cursor = &mut self.cursors[index];
         let Some(frame) = cursor.environment.frames.clone() else { return };
@@ -212,7 +212,7 @@ impl Growth {
         variables: usize,
     ) {
         let own = context.plan.state(id);
-        // The task's own variables are seen by its outputs.
+        // The task's outputs may use the task's own variables.
         let state = context.program.state(id);
         let of_loop = if state.is_loop() { state.variables.len() } else { 0 };
         let kept = if id == Program::ROOT { usize::MAX } else { variables.saturating_sub(of_loop) };

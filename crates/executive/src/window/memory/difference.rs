@@ -1,23 +1,23 @@
-//! In which facts two lists of changes differ, and whether that is beyond the tolerances of the facts.
+//! The facts in which two lists of changes differ, and whether the differences are within the tolerances of the facts.
 
 use ratn_model::fact::{Change, FactKey, FactPattern};
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 
-/// One fact, or several, that came out otherwise.
+/// One fact, or several, that came out otherwise than predicted.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Deviation {
     pub(crate) pattern: FactPattern,
-    /// What it was taken to be; `None`: nothing was said of it, or it was to be gone.
+    /// The predicted value; `None`: not mentioned, or deleted.
     pub(crate) was: Option<Value>,
-    /// What it is; `None`: nothing is said of it, or it is gone.
+    /// The present value; `None`: not mentioned, or deleted.
     pub(crate) is: Option<Value>,
-    /// The fact counts as the same.
+    /// Whether the deviation is within the tolerance.
     pub(crate) is_tolerated: bool,
 }
 
-/// All that came out otherwise.
+/// All deviations between two lists of changes.
 #[derive(Debug, Default)]
 pub(crate) struct Difference {
     pub(crate) deviations: Vec<Deviation>,
@@ -28,17 +28,17 @@ impl Difference {
         self.deviations.is_empty()
     }
 
-    /// The deviations that are within the tolerance, or beyond it.
+    /// The deviations that are within the tolerance, or those beyond it.
     pub(crate) fn that_are(&self, tolerated: bool) -> impl Iterator<Item = &Deviation> {
         self.deviations.iter().filter(move |deviation| deviation.is_tolerated == tolerated)
     }
 
-    /// Whether no deviation is about several facts at once.
+    /// Whether every deviation beyond the tolerance concerns a single fact.
     pub(super) fn is_of_single_facts(&self) -> bool {
         self.that_are(false).all(|deviation| deviation.pattern.arguments.iter().all(Option::is_some))
     }
 
-    /// What changes now, but for the facts that differ within the tolerance only: those as they were taken to be.
+    /// The present changes, but facts that differ within the tolerance only keep the values that readers have seen.
     pub(super) fn keep_otherwise(&self, was: &[Change], is: &[Change]) -> Vec<Change> {
         let differs = |key: &FactKey| self.that_are(false).any(|deviation| deviation.pattern.matches(key));
         let before = Final::of(was);
@@ -52,14 +52,14 @@ impl Difference {
         is.iter().map(kept).collect()
     }
 
-    /// These facts are not known any more, or were not compared.
+    /// Adds facts that are not known any more, or that were not compared.
     pub(super) fn add_unknown(&mut self, patterns: impl IntoIterator<Item = FactPattern>) {
         let unknown = |pattern| Deviation { pattern, was: None, is: None, is_tolerated: false };
         self.deviations.extend(patterns.into_iter().map(unknown));
     }
 
-    /// Adds the facts in which what was taken to change differs from what changes now. `elsewhere` is what a fact is that only
-    /// one of them names, where that is known.
+    /// Adds the facts in which the predicted changes `was` differ from the present changes `is`. `elsewhere` gives the value
+    /// of a fact that only one of the lists mentions, if it is known.
     pub(super) fn add(
         &mut self,
         was: &[Change],
@@ -98,7 +98,7 @@ impl Difference {
 }
 
 impl Deviation {
-    /// What came out otherwise, as a sentence.
+    /// The deviation as a sentence.
     pub(crate) fn sentence(&self) -> String {
         let said = |value: &Option<Value>| value.as_ref().map_or("nothing".to_owned(), ToString::to_string);
         match (&self.was, &self.is) {
@@ -108,7 +108,7 @@ impl Deviation {
     }
 }
 
-/// What a list of changes leaves.
+/// The final result of a list of changes.
 struct Final<'c> {
     keys: BTreeMap<&'c FactKey, Option<&'c Value>>,
     deleted: Vec<&'c FactPattern>,

@@ -1,8 +1,8 @@
-//! Sums of hashes of the root's facts, by what is looked at: kept up to date change by change, so that who reads a whole scene
-//! does not hash it anew each time.
+//! Sums of hashes of the root's facts, by the facts that readers look at. They are updated with every change, so that a reader
+//! of a whole scene need not hash it again each time.
 //!
-//! A sum does not depend on the order of facts, and a fact can be taken out of it: a multiset hash (Clarke et al. 2003), modulo
-//! 2¹²⁸.
+//! A sum does not depend on the order of facts, and a fact can be subtracted from it: a multiset hash (Clarke et al. 2003),
+//! modulo 2¹²⁸.
 
 use ratn_model::fact::{FactKey, FactPattern};
 use ratn_model::value::Value;
@@ -10,24 +10,22 @@ use ratn_world::digest::{Digester, Quick};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
 
-/// As many different patterns with `?` are kept.
+/// Limit of patterns with `?` for which a sum is kept.
 const MAX_KEPT: usize = 64;
 
 /// The sums that are kept.
 #[derive(Debug, Default)]
 pub(super) struct Digests {
-    /// By pattern; `None` is everything.
+    /// By pattern; `None` stands for all facts.
     kept: BTreeMap<Option<FactPattern>, Sum>,
 }
 
-/// The sum of some facts.
 #[derive(Debug, Default)]
 struct Sum {
     facts: BTreeMap<FactKey, u128>,
     sum: u128,
 }
 
-/// The hash of one fact.
 pub(super) fn hash(key: &FactKey, value: &Value) -> u128 {
     let mut digester = Digester::<Quick>::default();
     digester.fact(key, value);
@@ -35,7 +33,7 @@ pub(super) fn hash(key: &FactKey, value: &Value) -> u128 {
 }
 
 impl Digests {
-    /// The sum of the root's facts that match; `None` is all of them.
+    /// The sum of the root's facts that match; `None` stands for all facts.
     pub(super) fn sum(&mut self, root: &World, pattern: Option<&FactPattern>) -> u128 {
         if let Some(single) = pattern.filter(|pattern| pattern.arguments.iter().all(Option::is_some)) {
             return root.matching(single).map(|(key, fact)| hash(key, &fact.value)).sum();
@@ -61,7 +59,7 @@ impl Digests {
         sum
     }
 
-    /// The root's facts that match these patterns have changed.
+    /// Updates the sums for facts of the root that have changed.
     pub(super) fn update(&mut self, root: &World, changed: impl Iterator<Item = FactPattern>) {
         if self.kept.is_empty() {
             return;

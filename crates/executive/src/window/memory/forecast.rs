@@ -1,8 +1,8 @@
-//! Forecasts: what an instance changes of the world, predicted before it has ended, as it came out after; each effect by itself.
+//! Forecasts: the changes of the world by one instance, predicted before it has ended and exact afterwards, effect by effect.
 //!
-//! A forecast is made for its first reader, and kept. What it is made of is registered, so that it is made again when that
-//! changes, and its readers are told of the difference. An `increase` is worked out to the value that it leaves: then it hides
-//! older writers as a `set` does, and a chain of counters costs one step per writer.
+//! A forecast is made for its first reader and kept. Its inputs are registered, so that it is made again when they change, and
+//! its readers are told the difference. An `increase` is turned into a `set` of the resulting value: then it hides older
+//! writers, and a chain of counters costs one step per writer.
 
 use super::difference::Difference;
 use super::overlay::Overlay;
@@ -22,47 +22,48 @@ use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
 use std::sync::Arc;
 
-/// Beyond so many forecasts within each other the innermost is made first, without the others.
+/// Limit of nested forecasts; beyond it, the innermost one is made first, separately.
 const MAX_DEPTH: u32 = 24;
 
-/// Differences within the tolerance are kept in mind for so many versions; then all of them count as one beyond it.
+/// Limit of remembered versions that differ within the tolerance; beyond it, every difference counts as beyond the tolerance.
 const MAX_VERSIONS: usize = 4;
 
-/// Changes that belong together.
+/// The changes by one effect.
 pub(super) type Chunk = Arc<[Change]>;
 
-/// What an instance changes, along one of its arms.
+/// The changes by one instance along one of its arms.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Forecast {
     /// The outcome that the arm assumes.
     outcome: Outcome,
     is_vague: bool,
-    /// Per effect, in order; what is measured and not declared comes last.
+    /// By effect, in order; measured facts that are not declared come last.
     parts: SmallVec<[Part; 2]>,
-    /// What readers may have been shown that was otherwise, within the tolerance.
+    /// Earlier versions that readers may have seen; they differ within the tolerance.
     versions: Vec<Vec<Change>>,
 }
 
 /// One effect.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 enum Part {
-    /// Nobody has asked.
+    /// No reader has asked yet.
     Open,
     Known(Chunk),
-    /// Not known before something older has gone on; the facts that it may write.
+    /// Not known until an older instance has gone on; these are the facts that the effect may write.
     Blocked(Footprint),
 }
 
-/// What came of making forecasts again.
+/// The result of making an instance's forecasts again.
 #[derive(Debug, Default)]
 pub(crate) struct Refreshed {
     pub(crate) difference: Difference,
-    /// Something is known that was not.
+    /// Whether something is known that was not known before.
     pub(crate) is_known_now: bool,
 }
 
 impl<'a> Sight<'a> {
-    /// What a writer changes along a link of the facts that are looked at and that younger writers, of `hidden`, do not hide.
+    /// The changes by a writer along a link, for the facts that are looked at, except those that `hidden` covers (written by
+    /// younger writers).
     pub(super) fn effects(
         self,
         writer: &'a Instance,
@@ -86,7 +87,7 @@ impl<'a> Sight<'a> {
         Ok(chunks)
     }
 
-    /// Makes all of a forecast, unless something far away must be made first.
+    /// Makes all parts of a forecast, unless it depends on a deep chain that must be made first.
     pub(super) fn complete(self, writer: &'a Instance, outcome: Outcome, vague: bool) {
         let link = Link { writer: writer.id, outcome, vague };
         for place in 0..self.prepare(writer, outcome, vague) {
@@ -97,7 +98,7 @@ impl<'a> Sight<'a> {
         }
     }
 
-    /// Makes room for a forecast where there is none; of how many parts it is.
+    /// Adds an empty forecast if there is none; returns its number of parts.
     fn prepare(self, writer: &Instance, outcome: Outcome, is_vague: bool) -> usize {
         let of = |forecast: &Forecast| forecast.outcome == outcome && forecast.is_vague == is_vague;
         let mut forecasts = writer.memory.forecasts.borrow_mut();
@@ -118,7 +119,7 @@ impl<'a> Sight<'a> {
         }
     }
 
-    /// One part of a forecast, made if nobody has.
+    /// One part of a forecast; makes it if necessary.
     fn part(self, writer: &'a Instance, link: Link, place: usize) -> Part {
         let at = |forecast: &Forecast| forecast.outcome == link.outcome && forecast.is_vague == link.vague;
         {
@@ -174,7 +175,7 @@ impl<'a> Sight<'a> {
             }
             Declared::Effects(effects, measured) => match effects.get(place) {
                 Some(effect) => self.make_effect(writer, link, place, effect, measured),
-                // What is measured and not declared will fail; until then it is seen as it was.
+                // A measured fact that is not declared makes the instance fail later; until then readers see it.
                 None => {
                     let mut written: Vec<FactKey> = Vec::new();
                     for before in 0..place {
@@ -215,7 +216,7 @@ impl<'a> Sight<'a> {
         }
         let made = match bound {
             Ok(changes) => self.worked_out(&view, writer, link, place, changes),
-            // Wrong: it will end `aborted`; until then nobody may build on it.
+            // A wrong effect ends the instance `aborted`; until then nothing may depend on it.
             Err(EvaluateError::NotYetKnown { .. } | EvaluateError::Wrong { .. }) => Err(Blocked(writer.id)),
         };
         let part = match made {
@@ -226,7 +227,7 @@ impl<'a> Sight<'a> {
         part
     }
 
-    /// Every increase as the value that it leaves.
+    /// Replaces every increase by a `set` of the resulting value.
     fn worked_out(
         self,
         view: &View<'a>,
@@ -248,7 +249,7 @@ impl<'a> Sight<'a> {
         Ok(changes)
     }
 
-    /// What a fact is before an effect: what earlier effects of the same list make of it, or what it is at the place.
+    /// The value of a fact before an effect: after the earlier effects of the same list, or else at the instance's place.
     fn value_before(
         self,
         view: &View<'a>,
@@ -278,7 +279,7 @@ impl<'a> Sight<'a> {
         }
     }
 
-    /// What an instance declares to change along an arm.
+    /// The changes that an instance declares along an arm.
     fn declared<'w>(self, writer: &'w Instance, outcome: Outcome, is_vague: bool) -> Declared<'w>
     where
         'a: 'w,
@@ -307,8 +308,8 @@ impl<'a> Sight<'a> {
         self.plan.state(writer.state).outcome(&ended.outcome).unwrap_or(assumed)
     }
 
-    /// Makes the forecasts of an instance again that somebody has looked at: what came out otherwise. Without readers they are
-    /// forgotten.
+    /// Makes the forecasts of an instance again that have readers; returns what came out otherwise. Forecasts without readers
+    /// are dropped.
     pub(crate) fn refresh(self, id: InstanceId, tolerance: impl Fn(&FactKey) -> Tolerance) -> Refreshed {
         let mut refreshed = Refreshed::default();
         let Some(writer) = self.graph.get(id) else { return refreshed };
@@ -352,7 +353,7 @@ impl<'a> Sight<'a> {
         let all_unknown = forecast.parts.iter().any(|part| matches!(part, Part::Blocked(Footprint::Everything)));
         let (was, is) = (flat(&before), flat(&forecast.parts));
         if forecast.parts.iter().any(|part| is_blocked(&part)) && before.iter().any(|part| !is_blocked(&part)) {
-            // Whoever has used what was known of it has to wait.
+            // Readers of values that are no longer known have to wait.
             refreshed.difference.add_unknown(unknown.flatten());
             if all_unknown {
                 refreshed.difference.add_unknown(was.iter().map(Change::pattern));
@@ -369,7 +370,7 @@ impl<'a> Sight<'a> {
             if is_full || !difference.is_of_single_facts() {
                 difference.add(&version, &is, |_| Tolerance::EXACT, |_| None);
             } else {
-                // Whoever has used what differs is told; the others have still seen the rest as it was.
+                // Readers of the differing facts are told; for the others this version still holds.
                 let told = difference.keep_otherwise(&version, &is);
                 if told != is && !forecast.versions.contains(&told) {
                     forecast.versions.push(told);
@@ -379,8 +380,8 @@ impl<'a> Sight<'a> {
         }
     }
 
-    /// What readers of an instance that becomes real took its changes to be, compared with what it changed. `before` and `after`
-    /// are what a fact was in the root, and is.
+    /// Compares the changes that readers expected from an instance with those that it has made. `before` gives the earlier value
+    /// of a fact in the root.
     pub(crate) fn compare_with_actual(
         self,
         writer: &Instance,
@@ -412,7 +413,7 @@ impl<'a> Sight<'a> {
         difference
     }
 
-    /// The facts that may be otherwise behind a writer: what it may write, and what others may have written while it waited.
+    /// The facts that may differ behind a writer: those it may write, and those that others may write while it waits.
     pub(crate) fn may_differ_along(self, view: &View<'a>, link: Link) -> Footprint {
         let own = self.may_write_along(view, link);
         match &self.plan.state(view.instance.state).awaited {
@@ -422,7 +423,7 @@ impl<'a> Sight<'a> {
         }
     }
 
-    /// The facts that a writer may write along a link, as far as a view knows.
+    /// The facts that a writer may write along a link, as far as the view knows.
     pub(crate) fn may_write_along(self, view: &View<'a>, link: Link) -> Footprint {
         let writer = view.instance;
         let own = self.plan.state(writer.state);
@@ -450,17 +451,17 @@ impl<'a> Sight<'a> {
     }
 }
 
-/// What an instance declares to change.
+/// The changes that an instance declares.
 enum Declared<'w> {
     Nothing,
-    /// These effects, with what was measured.
+    /// These effects, with the measured values.
     Effects(&'w [EffectExpr], &'w [(FactKey, Value)]),
     Exactly(&'w [Change]),
     Unknown,
 }
 
 impl View<'_> {
-    /// What was used by this view is told of its user.
+    /// Registers the view's instance as a user of what it has used.
     pub(crate) fn register(&self, purpose: Purpose) {
         for (id, of) in self.take_used() {
             if let Some(used) = self.sight.graph.get(id).filter(|used| used.id != self.instance.id) {
@@ -469,7 +470,7 @@ impl View<'_> {
         }
     }
 
-    /// It uses the outputs of these.
+    /// Notes outputs that the view uses.
     pub(crate) fn use_outputs(&self, of: impl IntoIterator<Item = InstanceId>) {
         of.into_iter().for_each(|id| self.note_used(id, Source::Outputs));
     }

@@ -1,21 +1,21 @@
-//! Memory renaming: what the world is at a place of the program, before it is so.
+//! Memory renaming: the world as it will be at a place of the program.
 //!
-//! An instance sees the root with the effects of the older instances of its path that have not retired. Nothing is copied: a
-//! lookup walks the chain of older writers of a predicate, youngest first, as far as it must (`walk`, `view`). What a writer
-//! changes, predicted or measured, is worked out once and kept (`forecast`), as a memo of incremental computation is.
+//! An instance sees the root plus the effects of the older instances of its path that have not retired. Nothing is copied: a
+//! lookup follows the chain of older writers of a predicate, youngest first, as far as needed (`walk`, `view`). The changes
+//! by a writer, predicted or measured, are computed once and kept (`forecast`), like a memo of incremental computation.
 //!
-//! A reader is registered with every writer that was *visited*, also where that one had nothing to write: absence is read,
-//! too. When what a writer changes comes out otherwise, beyond the tolerances of the facts, its users are told
-//! (`difference`); where it comes out the same, nobody is.
+//! A reader is registered with every writer that it *visited*, even if that writer wrote nothing relevant: the absence of a
+//! fact is read, too. When the changes by a writer deviate beyond the tolerances of the facts, its users are told
+//! (`difference`); otherwise nobody is.
 //!
 //! | | |
 //! |---|---|
 //! | `walk` | the older writers of some facts, youngest first |
-//! | `forecast` | what a writer changes, as far as is known |
-//! | `view` | what an instance sees: variables, ports, facts |
+//! | `forecast` | the changes by a writer, as far as they are known |
+//! | `view` | the variables, ports and facts that an instance sees |
 //! | `overlay` | changes over a world |
-//! | `difference` | in which facts two lists of changes differ |
-//! | `seen`, `digests` | what a result was made of, for telling whether the same would come of it again |
+//! | `difference` | the facts in which two lists of changes differ |
+//! | `seen`, `digests` | the inputs of a result, to tell whether they are still the same |
 //! | `settled` | results that cannot change any more |
 
 mod difference;
@@ -45,16 +45,16 @@ use std::collections::BTreeSet;
 pub(crate) use view::{Blocked, View, facts_of};
 pub(crate) use walk::Looked;
 
-/// What an instance's place in memory renaming is: part of the instance, private to this module.
+/// The place of an instance in memory renaming: part of the instance, private to this module.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct MemoryCell {
-    /// Who has used its outputs or looked at what it changes.
+    /// The instances that have used its outputs or looked at its changes.
     users: RefCell<SmallVec<[User; 2]>>,
-    /// What it changes, along each arm that somebody has looked from.
+    /// Its changes, along each arm from which a reader has looked.
     forecasts: RefCell<SmallVec<[Forecast; 1]>>,
 }
 
-/// Somebody whose result, or whose effects, are made of what an older instance puts out or changes.
+/// An instance whose result or effects depend on the outputs or changes of an older instance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub(crate) struct User {
     pub(crate) id: InstanceId,
@@ -62,16 +62,16 @@ pub(crate) struct User {
     pub(crate) purpose: Purpose,
 }
 
-/// What is used.
+/// What a user depends on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub(crate) enum Source {
     /// Outputs, or values of variables.
     Outputs,
-    /// What it changes of the world, be it nothing.
+    /// Changes of the world, even if there are none.
     World,
 }
 
-/// What it is used for.
+/// Which part of the user depends on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub(crate) enum Purpose {
     /// The user's own result.
@@ -80,27 +80,27 @@ pub(crate) enum Purpose {
     Effects,
 }
 
-/// What memory renaming keeps beside the instances.
+/// The state of memory renaming beside the instances.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Memory {
     #[serde(skip)]
     deep: Deep,
-    /// What anybody would find in the root: no part of a checkpoint.
+    /// Derived from the root, so not part of a checkpoint.
     #[serde(skip)]
     digests: RefCell<Digests>,
-    /// Instances whose outputs or effects may be otherwise than their users know.
+    /// Instances whose outputs or effects may differ from what their users know.
     stale: BTreeSet<InstanceId>,
     outside: Outside,
 }
 
-/// Forecasts that are made of forecasts that are made of forecasts: beyond a depth, the innermost is made first.
+/// For long chains of forecasts that depend on each other: beyond a depth, the innermost is made first.
 #[derive(Debug, Default)]
 struct Deep {
     depth: Cell<u32>,
     suspended: Cell<Option<(InstanceId, usize, bool)>>,
 }
 
-/// Where everything that a view needs stands.
+/// References to everything that a view needs.
 #[derive(Clone, Copy)]
 pub(crate) struct Sight<'a> {
     pub(crate) program: &'a Program,
@@ -114,14 +114,14 @@ impl MemoryCell {
     fn add_user(&self, user: User) {
         let mut users = self.users.borrow_mut();
         users.push(user);
-        // Who asks often stands there often; now and then that is tidied up.
+        // The same user may be added often; duplicates are removed now and then.
         if users.len() >= 16 && users.len().is_power_of_two() {
             users.sort_unstable();
             users.dedup();
         }
     }
 
-    /// Its users, each once.
+    /// Its users, without duplicates.
     pub(crate) fn users(&self) -> SmallVec<[User; 2]> {
         let mut users = self.users.borrow_mut();
         users.sort_unstable();
@@ -133,12 +133,11 @@ impl MemoryCell {
         !self.users.borrow().is_empty()
     }
 
-    /// Nobody uses it any more.
     pub(crate) fn forget_users(&self) {
         self.users.borrow_mut().clear();
     }
 
-    /// What it changes is worked out anew for whoever looks next.
+    /// Drops the forecasts; the next reader makes them again.
     pub(crate) fn forget_forecasts(&self) {
         self.forecasts.borrow_mut().clear();
     }
@@ -149,7 +148,7 @@ impl MemoryCell {
 }
 
 impl Memory {
-    /// Where a view looks from.
+    /// The references for views.
     pub(crate) fn sight<'a>(
         &'a self,
         program: &'a Program,
@@ -160,27 +159,27 @@ impl Memory {
         Sight { program, plan, root, graph, memory: self }
     }
 
-    /// What it puts out or changes may be otherwise now.
+    /// Marks an instance: its outputs or changes may differ now.
     pub(crate) fn mark(&mut self, id: InstanceId) {
         self.stale.insert(id);
     }
 
-    /// It has been looked at, or is gone.
+    /// Unmarks an instance that was examined or has left the window.
     pub(crate) fn unmark(&mut self, id: InstanceId) {
         self.stale.remove(&id);
     }
 
-    /// The oldest that may be otherwise: what is made of it is younger.
+    /// Takes the oldest marked instance; everything that depends on it is younger.
     pub(crate) fn next_stale(&mut self) -> Option<InstanceId> {
         self.stale.pop_first()
     }
 
-    /// Whether there is none.
+    /// Whether no instance is marked.
     pub(crate) fn is_fresh(&self) -> bool {
         self.stale.is_empty()
     }
 
-    /// The root has changed so.
+    /// The root has changed in these patterns.
     pub(crate) fn root_changed<'c>(
         &self,
         root: &World,
@@ -191,7 +190,7 @@ impl Memory {
 }
 
 impl<'a> Sight<'a> {
-    /// Uses something of the sight, and makes the forecasts first that it turns out to need from far away.
+    /// Calls `look`; if it needs forecasts at the end of a deep chain, makes these first and repeats the call.
     pub(crate) fn with<T>(self, look: impl Fn(Sight<'a>) -> T) -> T {
         loop {
             let looked = look(self);
@@ -202,7 +201,7 @@ impl<'a> Sight<'a> {
         }
     }
 
-    /// Makes a forecast, and before it those that it is made of: with a stack of its own, however long the chain is.
+    /// Makes a forecast after the ones that it depends on, with an explicit stack, so that the chain may have any length.
     fn forecast_from_far(self, first: (InstanceId, usize, bool)) {
         let deep = &self.memory.deep;
         let depth = deep.depth.replace(0);

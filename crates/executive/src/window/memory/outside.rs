@@ -1,7 +1,6 @@
-//! Facts of the root that change from outside: which of them are beyond the tolerance of what anybody has seen.
+//! Changes of the root from outside: which of them are beyond the tolerance of the values that readers may have seen.
 //!
-//! A fact that creeps, each step within the tolerance, is told of when it has come too far from what it was when somebody may have
-//! looked.
+//! A fact that drifts in steps within the tolerance counts as changed once it is too far from a value that a reader may have seen.
 
 use super::Memory;
 use ratn_model::fact::{FactKey, FactPattern};
@@ -11,29 +10,29 @@ use ratn_world::world::World;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Of one fact, so many values that somebody may have seen are kept; then it counts as otherwise.
+/// Limit of values per fact that readers may have seen; beyond it, the fact counts as changed.
 const MAX_VERSIONS: usize = 8;
 
-/// What is known of changes from outside.
+/// What is known about changes from outside.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(super) struct Outside {
-    /// What facts were that have changed within their tolerance.
+    /// Earlier values of facts that have changed within their tolerance.
     seen: BTreeMap<FactKey, Vec<Option<Value>>>,
-    /// Facts that have changed, and nobody was told.
+    /// Changed facts of which readers were not told yet.
     news: News,
 }
 
 /// Facts that have changed from outside.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct News {
-    /// At all.
+    /// All of them.
     pub(crate) changed: Vec<FactPattern>,
-    /// Beyond the tolerance of what anybody has seen.
+    /// Those beyond the tolerance of a value that a reader may have seen.
     pub(crate) otherwise: Vec<FactPattern>,
 }
 
 impl Memory {
-    /// The root is about to be changed so from outside.
+    /// Compares changes from outside with the root, before they are applied to it.
     pub(crate) fn compare_outside(
         &mut self,
         root: &World,
@@ -62,7 +61,7 @@ impl Memory {
         }
     }
 
-    /// The facts that have changed since this was asked last.
+    /// Takes the facts that have changed since the last call.
     pub(crate) fn take_news_from_outside(&mut self) -> News {
         std::mem::take(&mut self.outside.news)
     }

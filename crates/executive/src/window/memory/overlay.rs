@@ -1,16 +1,16 @@
-//! Changes over a world, without the world: which facts are otherwise.
+//! Changes over a world, without a copy of the world: the facts that differ.
 
 use ratn_model::fact::{Change, FactKey, FactPattern};
 use ratn_model::value::Value;
 use ratn_world::world::World;
 use std::collections::BTreeMap;
 
-/// What a list of changes comes to. An `increase` has been worked out before.
+/// The result of a list of changes, in which every `increase` has been replaced by its value.
 #[derive(Debug, Default)]
 pub(super) struct Overlay {
-    /// `None`: it does not hold.
+    /// `None`: the fact does not hold.
     keys: BTreeMap<FactKey, Option<Value>>,
-    /// Facts of the world below that match do not hold, unless they stand above.
+    /// Facts of the world below that match do not hold, unless they are in `keys`.
     deleted: Vec<FactPattern>,
 }
 
@@ -33,7 +33,8 @@ impl Overlay {
         }
     }
 
-    /// What a list of changes makes of a fact, if anything: `Some(None)` where it is gone.
+    /// The value of a fact after a list of changes; `Some(None)` if it was deleted, `None` if the list does not change
+    /// it.
     pub(super) fn value_after(changes: &[Change], fact: &FactKey) -> Option<Option<Value>> {
         changes.iter().rev().find_map(|change| match change {
             Change::Set { fact: set, value } => (set == fact).then(|| Some(value.clone())),
@@ -46,7 +47,7 @@ impl Overlay {
         self.deleted.iter().any(|pattern| pattern.matches(key))
     }
 
-    /// Visits the facts that match, in the order of keys, until told to stop.
+    /// Visits the facts that match, in the order of keys, until `visit` returns false.
     pub(super) fn each_fact(
         &self,
         below: &World,
@@ -74,7 +75,7 @@ impl Overlay {
         }
     }
 
-    /// Every fact of a pattern that is otherwise than below: its value below and here.
+    /// Every fact of a pattern that differs from the world below: its value below and here.
     pub(super) fn differing<'o>(
         &'o self,
         below: &'o World,

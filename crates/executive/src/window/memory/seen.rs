@@ -1,4 +1,4 @@
-//! The facts that a result was made of, and a digest of their values.
+//! The facts on which a result depends, and a digest of their values.
 
 use super::digests::hash;
 use super::overlay::Overlay;
@@ -10,36 +10,35 @@ use ratn_world::digest::{Digester, Quick};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// What a result was made of.
+/// The inputs of a result: facts and input ports.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct Seen {
     /// The facts that it may have looked at.
     pub(crate) read: Vec<Footprint>,
-    /// What they came to, one number per pattern.
+    /// A digest of their values, one number per pattern.
     facts: Vec<u128>,
-    /// What its inputs come to.
+    /// A digest of the input ports.
     pub(crate) inputs: u128,
 }
 
 impl Seen {
-    /// These facts were looked at, whatever they were: no other result is made of the same.
+    /// Adds facts without their values, so that no other result counts as having the same inputs.
     pub(crate) fn look_at(&mut self, read: Footprint) {
         self.read.push(read);
     }
 
-    /// The inputs of an action.
+    /// Sets the input ports of an action.
     pub(crate) fn see_inputs(&mut self, inputs: &BTreeMap<String, Value>) {
         let mut digester = Digester::<Quick>::default();
         digester.values(inputs);
         self.inputs = digester.quick();
     }
 
-    /// Whether the same is computed of it.
+    /// Whether the same facts and input ports were seen, so that the result is the same.
     pub(crate) fn is_like(&self, other: &Seen) -> bool {
         self.inputs == other.inputs && self.facts == other.facts && self.read == other.read
     }
 
-    /// Whether the same facts were seen.
     pub(crate) fn saw_the_same(&self, other: &Seen) -> bool {
         self.facts == other.facts && self.read == other.read
     }
@@ -55,7 +54,7 @@ fn all(by_writer: &[ByWriter]) -> impl Iterator<Item = &Change> {
 }
 
 impl View<'_> {
-    /// Adds the facts of a footprint, as they are at this place, to what is seen.
+    /// Adds the facts of a footprint, with their values at this place.
     pub(crate) fn see(&self, read: Footprint, seen: &mut Seen) -> Result<(), Blocked> {
         if read.is_nothing() {
             return Ok(());
@@ -81,7 +80,7 @@ impl View<'_> {
         Ok(())
     }
 
-    /// Whether the actual world shows these facts as they are at this place.
+    /// Whether the actual world shows these facts as they will be at this place.
     pub(crate) fn is_shown(&self, looked: &Footprint) -> Result<bool, Blocked> {
         let changes = self.changes(Looked::at(looked))?;
         let changes: Vec<&Change> = all(&changes).collect();
@@ -90,7 +89,7 @@ impl View<'_> {
 }
 
 impl Seen {
-    /// Adds what else was looked at.
+    /// Adds further facts.
     pub(crate) fn extend(&mut self, other: Seen) {
         self.read.extend(other.read);
         self.facts.extend(other.facts);

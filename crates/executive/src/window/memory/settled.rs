@@ -1,9 +1,9 @@
-//! Settled: a result that cannot change any more, although it may not have retired. Conditions and loops decide from settled
-//! results.
+//! Settled results: they can no longer change, although they may not have retired. Conditions and loops decide by settled results
+//! only.
 //!
-//! A result is settled when its path is decided, everything that it is made of is settled, and no older instance that has not
-//! retired may write what it has looked at. What may be written counts by what is settled, too: a key that comes from a result
-//! which may still change may be any key.
+//! A result is settled when its path is decided, its inputs are settled, and no older instance that has not retired may write a
+//! fact that it has read. What such an instance may write is judged by settled results, too: a key that comes from a result that
+//! may still change counts as any key.
 
 use super::view::{View, facts_of};
 use super::walk::Looked;
@@ -17,17 +17,17 @@ use ratn_model::expression::Expr;
 use ratn_model::id::InstanceId;
 use std::collections::BTreeMap;
 
-/// What is found of one instance.
+/// The result of examining one instance.
 enum Step {
     Settled,
-    /// Not before this instance has gone on.
+    /// Not settled until this instance has gone on.
     Blocked(InstanceId),
-    /// It depends on whether this one is settled.
+    /// Depends on whether this instance is settled.
     After(InstanceId),
 }
 
-/// Whom to wait for before the result of an instance cannot change any more; `None` when it cannot. Without recursion: results of
-/// results of results may be many.
+/// The instance to wait for until a result is settled; `None` if it is settled. Without recursion, because chains of results may be
+/// long.
 pub(crate) fn unsettled(
     graph: &mut Graph,
     memory: &Memory,
@@ -63,7 +63,7 @@ fn unsettled_after(
     blocked.get(&id).copied()
 }
 
-/// What a decision from these expressions waits for.
+/// What a decision by these expressions has to wait for; `None`: it can be made.
 pub(crate) fn undecidable(
     graph: &mut Graph,
     memory: &Memory,
@@ -140,8 +140,8 @@ impl<'a> Sight<'a> {
         found
     }
 
-    /// Whether an instance that has not retired may write one of these facts, or was predicted to; and whose result, if any, has to
-    /// be settled before more can be said.
+    /// Whether an instance that has not retired may write one of these facts, or was predicted to; and the instance whose result
+    /// must be settled before more is known, if there is one.
     fn may_still_write(self, writer: &'a Instance, link: Link, looked: Looked<'_>) -> (bool, Option<InstanceId>) {
         let predicted = writer.ended().is_some()
             && self.effects(writer, link, looked, &[]).map_or(true, |chunks| !chunks.is_empty());
@@ -155,13 +155,13 @@ impl<'a> Sight<'a> {
 }
 
 impl View<'_> {
-    /// As [`Sight::writer_of`], as a step: it may depend on whether a result is settled that a key comes from.
+    /// As [`Sight::writer_of`], as a step: it may depend on whether the result that gives a key is settled.
     fn writer_of(&self, looked: Looked<'_>, blocked: &BTreeMap<InstanceId, InstanceId>) -> Option<Step> {
         let mut found = None;
         self.walk(looked, |writer, link| {
             let (may, after) = self.sight.may_still_write(writer, link, looked);
             if may {
-                // A key is known before its writer is real: whoever it comes from is waited for first.
+                // A key is known before its writer has retired, so wait first for the instance that the key comes from.
                 found = Some(match after.filter(|id| *id != writer.id) {
                     None => Step::Blocked(writer.id),
                     Some(older) => match blocked.get(&older) {

@@ -1,6 +1,6 @@
 //! The view of an instance: its variables, the ports of older instances, and the world at its place in the program.
 //!
-//! Where something is not known yet, the view names the instance to wait for.
+//! Where a value is not known yet, the view names the instance to wait for.
 
 use super::forecast::Chunk;
 use super::overlay::Overlay;
@@ -18,40 +18,39 @@ use smallvec::SmallVec;
 use std::borrow::Cow;
 use std::cell::{Cell, RefCell};
 
-/// What one writer changes, each effect by itself.
+/// The changes by one writer, effect by effect.
 pub(super) type ByWriter = (InstanceId, SmallVec<[Chunk; 2]>);
 
-/// One instance's view.
 pub(crate) struct View<'a> {
     pub(crate) sight: Sight<'a>,
     pub(crate) instance: &'a Instance,
     /// Its own outputs, once it has ended.
     outputs: Option<&'a Outputs>,
-    /// Only what cannot change any more counts as known.
+    /// Whether only settled results count as known.
     only_settled: bool,
-    /// Whom to wait for, where something was not known.
+    /// The instance to wait for, if a value was not known.
     blocker: Cell<Option<InstanceId>>,
-    /// Whose outputs were used and whose effects were looked at.
+    /// The instances whose outputs were used or whose effects were looked at.
     used: RefCell<SmallVec<[(InstanceId, Source); 4]>>,
 }
 
-/// Not known before this instance has gone on.
+/// Not known until this instance has gone on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Blocked(pub(crate) InstanceId);
 
 impl<'a> Sight<'a> {
-    /// What an instance sees; with its own outputs, if it has ended.
+    /// The view of an instance; with its own outputs, if it has ended.
     pub(crate) fn view(self, instance: &'a Instance, outputs: Option<&'a Outputs>) -> View<'a> {
         let (blocker, used) = (Cell::new(None), RefCell::default());
         View { sight: self, instance, outputs, only_settled: false, blocker, used }
     }
 
-    /// What it sees of what cannot change any more.
+    /// The view in which only settled results count as known.
     pub(super) fn settled_view(self, instance: &'a Instance) -> View<'a> {
         View { only_settled: true, ..self.view(instance, None) }
     }
 
-    /// What a producer that has ended assigns to variables: a routine does also where it ends badly.
+    /// The values that an ended producer assigns to variables; a routine assigns also when it fails.
     pub(crate) fn assigned_by(self, producer: &'a Producer) -> Option<&'a Outputs> {
         let alive = || self.graph.get(producer.instance)?.ended().map(|ended| &ended.outputs);
         producer.outputs().or_else(alive)
@@ -62,7 +61,7 @@ impl<'a> Sight<'a> {
         producer.outputs().or_else(|| self.graph.get(producer.instance)?.outputs())
     }
 
-    /// The producers, in the window, of the outputs and variables that an instance reads.
+    /// The instances in the window that produce the outputs and variables which an instance reads.
     pub(crate) fn producers_of(self, instance: &'a Instance) -> impl Iterator<Item = InstanceId> + 'a {
         let plan = self.plan;
         let own = plan.state(instance.state);
@@ -83,7 +82,7 @@ impl<'a> Sight<'a> {
             .filter(move |id| *id != instance.id && self.graph.contains(*id))
     }
 
-    /// The first older instance whose output or assignment is needed and not there yet.
+    /// The first older instance whose output or assignment is needed and does not exist yet.
     pub(crate) fn missing(
         self,
         instance: &'a Instance,
@@ -108,7 +107,7 @@ impl<'a> Sight<'a> {
 }
 
 impl<'a> View<'a> {
-    /// Whom to wait for before what was not known may be.
+    /// The instance to wait for, if a value was not known.
     pub(crate) fn blocker(&self) -> Option<InstanceId> {
         self.blocker.get()
     }
@@ -120,7 +119,7 @@ impl<'a> View<'a> {
         }
     }
 
-    /// What was used since this was asked last.
+    /// Takes what was used since the last call.
     pub(crate) fn take_used(&self) -> SmallVec<[(InstanceId, Source); 4]> {
         let mut used = self.used.take();
         used.sort_unstable();
@@ -149,13 +148,13 @@ impl<'a> View<'a> {
         instance.is_some_and(|instance| instance.ended().is_none() || !self.counts(producer))
     }
 
-    /// The effects of older instances on some facts, in program order, each writer's together.
+    /// The effects of older instances on some facts, in program order, grouped by writer.
     pub(crate) fn changes(&self, looked: Looked<'_>) -> Result<Vec<ByWriter>, Blocked> {
         let mut by_writer: Vec<ByWriter> = Vec::new();
         if looked.is_nothing() {
             return Ok(by_writer);
         }
-        // What a younger writer hides of the older ones is not asked of them.
+        // Older writers are not asked for facts that a younger writer hides.
         let mut hidden: Vec<FactPattern> = Vec::new();
         let mut failed = None;
         self.walk(looked, |writer, link| {
@@ -186,7 +185,7 @@ impl<'a> View<'a> {
         Ok(by_writer)
     }
 
-    /// The same as changes alone, of the facts that are looked at.
+    /// The same as lists of changes, restricted to the facts that are looked at.
     pub(crate) fn changes_by_writer(&self, footprint: &Footprint) -> Result<Vec<(InstanceId, Vec<Change>)>, Blocked> {
         let looked = Looked::at(footprint);
         let by_writer = self.changes(looked)?.into_iter();
@@ -203,7 +202,7 @@ impl<'a> View<'a> {
         links.map(|link| link.writer).filter(|writer| self.sight.graph.contains(*writer)).max()
     }
 
-    /// Whether what a writer changes of some facts is seen from here: no younger writer hides all of it.
+    /// Whether changes by a writer of some facts are visible from here: no younger writer hides all of them.
     pub(crate) fn is_visible(&self, writer: InstanceId, patterns: &[FactPattern]) -> bool {
         let looked = Looked::Patterns(patterns);
         let mut hidden: Vec<FactPattern> = Vec::new();
@@ -221,7 +220,7 @@ impl<'a> View<'a> {
         is_visible
     }
 
-    /// The one fact of a pattern without `?`: the youngest writer's word, or the root's.
+    /// The fact of a pattern without `?`: from the youngest writer, or else from the root.
     fn single_fact(&self, pattern: &FactPattern) -> Lookup<'_> {
         let looked = Looked::Patterns(std::slice::from_ref(pattern));
         let mut found = None;
@@ -250,7 +249,7 @@ impl<'a> View<'a> {
         })
     }
 
-    /// Whether a writer in the window stands between here and the root, for what is looked at.
+    /// Whether there is a writer in the window between here and the root for these facts.
     fn is_changed(&self, pattern: &FactPattern) -> bool {
         let mut is_changed = false;
         self.walk(Looked::Patterns(std::slice::from_ref(pattern)), |_, _| {
@@ -299,7 +298,8 @@ impl Scope for View<'_> {
         written.or_else(|| self.sight.program.state(state).defaults.get(port)).map(Cow::Borrowed)
     }
 
-    /// Who writes an output is known as soon as the way to here is; whether it did, when it has ended: an outcome of its own may leave it out.
+    /// Which producer writes an output is known as soon as the path to here is. Whether it wrote the output is known when it has ended,
+    /// because an outcome of the state's own may leave it out.
     fn given(&self, state: StateId, port: &str) -> Given {
         let environment = &self.instance.environment;
         let plan = self.sight.plan;

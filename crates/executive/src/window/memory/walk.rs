@@ -1,4 +1,4 @@
-//! The chain of older writers: from an environment, youngest first, as far as the reader needs.
+//! Walking the chain of older writers: from an environment, youngest first, as far as the reader needs.
 
 use super::view::View;
 use crate::plan::{Chain, EVERYTHING, Plan};
@@ -28,7 +28,7 @@ impl<'p> Looked<'p> {
         matches!(self, Looked::Patterns([]))
     }
 
-    /// Whether some fact of a pattern is looked at.
+    /// Whether any of these facts matches the pattern.
     pub(crate) fn overlaps(self, pattern: &FactPattern) -> bool {
         match self {
             Looked::Everything => true,
@@ -44,7 +44,7 @@ impl<'p> Looked<'p> {
         }
     }
 
-    /// The chains whose writers are to be visited.
+    /// The chains with the possible writers of these facts.
     fn chains(self, plan: &Plan) -> SmallVec<[Chain; 4]> {
         let mut chains: SmallVec<[Chain; 4]> = SmallVec::new();
         chains.push(plan.chain_of(EVERYTHING));
@@ -52,7 +52,7 @@ impl<'p> Looked<'p> {
             Looked::Everything => chains.extend(plan.predicates().skip(1).map(|predicate| plan.chain_of(predicate))),
             Looked::Patterns(patterns) => {
                 for chain in patterns.iter().flat_map(|pattern| plan.chains_of(pattern)).flatten() {
-                    // Several patterns of one predicate may be one chain.
+                    // Several patterns of one predicate may have the same chain.
                     if !chains.contains(&chain) {
                         chains.push(chain);
                     }
@@ -71,13 +71,14 @@ struct Next {
 }
 
 impl<'a> View<'a> {
-    /// Visits the older writers of these facts that have not retired, youngest first and each once, while told to go on.
+    /// Visits the older writers of these facts that have not retired, youngest first and each once, as long as `visit`
+    /// returns true.
     pub(super) fn walk(&self, looked: Looked<'_>, mut visit: impl FnMut(&'a Instance, Link) -> bool) {
         let graph = self.sight.graph;
         let mut open: SmallVec<[Next; 4]> = SmallVec::new();
         let push = |open: &mut SmallVec<[Next; 4]>, chain: Chain, link: Option<Link>| {
             let Some(link) = link.filter(|link| graph.contains(link.writer)) else { return };
-            // Several ways, over regions, may lead to the same writer.
+            // Several paths through regions may lead to the same writer.
             if !open.iter().any(|next| next.chain == chain && next.link.writer == link.writer) {
                 open.push(Next { chain, link });
             }
@@ -109,9 +110,9 @@ impl<'a> View<'a> {
                 return;
             }
         }
-        // A younger writer that has retired already hides those that still run beside it.
+        // Detached writers that still run; a younger writer that has retired already hides them in the root.
         for id in graph.detached().iter().rev().filter(|id| **id < self.instance.id && !beside.contains(id)) {
-            // What regions beside it do counts when it is real.
+            // Effects of concurrent regions count once they are real.
             if let Some(writer) = graph.get(*id)
                 && is_in_order(writer, self.instance)
                 && !visit(writer, self.link_beside(writer))
@@ -123,7 +124,8 @@ impl<'a> View<'a> {
 }
 
 impl View<'_> {
-    /// A running PIA that no chain leads to any more: along the arm that it has, or along any if its path was left.
+    /// The link to a detached PIA that no chain contains any more: along its arm, or along all arms if its path was
+    /// left.
     fn link_beside(&self, writer: &Instance) -> Link {
         let arms = &self.sight.plan.state(writer.state).arms;
         let own = writer.arms.first().and_then(|own| arms.iter().find(|arm| arm.outcomes == own.outcomes));

@@ -1,28 +1,28 @@
-//! Expressions → conditions: each either finds facts, or tests what has been found.
+//! Expressions → conditions: each condition either finds facts or tests values already found.
 
 use super::MAX_CONDITIONS;
 use super::plan::PlanError;
 use crate::expression::{BinaryOperator, Expr, FactExpr, Function, UnaryOperator};
 
-/// A condition whose facts stand by themselves.
+/// A condition in which each fact is separate.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Condition {
-    /// There is such a fact.
+    /// There is such a fact with such a value.
     Fact(FactExpr, Says),
-    /// It is true; the facts in it may be absent.
+    /// The expression is true; facts in it may be absent.
     Test(Expr),
-    /// There is an answer to these, or there is none.
+    /// There is an answer to these (true), or none (false).
     Answers(Vec<Condition>, bool),
 }
 
-/// What a fact says.
+/// The required value of a fact.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Says {
-    /// Whatever.
+    /// Any value.
     Anything,
     /// Neither false nor null.
     Yes,
-    /// This.
+    /// This value.
     Value(Expr),
 }
 
@@ -69,7 +69,7 @@ impl Made {
             Expr::Binary(BinaryOperator::Equal, a, b) => match (a.as_ref(), b.as_ref()) {
                 (Expr::Fact(fact), value) | (value, Expr::Fact(fact)) => {
                     let value = self.without_facts(value, into)?;
-                    // What may need the fact's own arguments is compared once they are bound.
+                    // The value may need variables that the fact itself binds, so it is compared afterwards.
                     if matches!(value, Expr::Unknown(_)) || !mentions_unknowns(&value) {
                         self.fact(fact, Says::Value(value), into)?;
                     } else {
@@ -104,7 +104,7 @@ impl Made {
         Ok(())
     }
 
-    /// The expression with a variable in the place of each fact that it cannot be true without; those become conditions.
+    /// Replaces each fact that must hold for the expression to be true by a variable; these facts become conditions.
     fn without_facts(&mut self, expr: &Expr, into: &mut Vec<Condition>) -> Result<Expr, PlanError> {
         let mut expr = expr.clone();
         let mut out = TakeOut { made: self, into, problem: None };
@@ -142,7 +142,7 @@ impl TakeOut<'_> {
             | Expr::Port { .. }
             | Expr::Element(_)
             | Expr::Unknown(_) => {}
-            // Facts of its body are looked up for each element.
+            // Facts in the body are looked up for each element.
             Expr::Each { list, .. } => self.strict(list),
             Expr::Call(Function::Either, _) => {}
             Expr::Call(Function::If, arguments) => arguments.iter_mut().take(1).for_each(|first| self.strict(first)),
@@ -165,7 +165,7 @@ impl TakeOut<'_> {
             self.problem = Some(PlanError::TooLarge);
             return;
         }
-        // No name that can be written; in messages it stands as the fact.
+        // A name that cannot be written in a file; messages show it as the fact.
         let name = format!("{fact}#{}?", self.made.hidden);
         let taken = fact.clone();
         *expr = Expr::Unknown(name.clone());

@@ -1,4 +1,4 @@
-//! Conditions → steps, in an order in which each has what it needs.
+//! Conditions → steps, in an order in which each step has its inputs.
 
 use super::conditions::{Condition, Says, conditions};
 use crate::expression::scope::NothingKnown;
@@ -6,25 +6,25 @@ use crate::expression::{BinaryOperator, Expr, FactExpr};
 use crate::fact::FactPattern;
 use std::collections::BTreeSet;
 
-/// A query ready to be answered.
+/// A planned query.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
-    /// The variables that an answer gives values to, in the order of the text; those that cannot be written come last.
+    /// The variables of an answer, in the order of the text; those with generated names come last.
     pub(super) variables: Vec<String>,
-    /// As many of them have names.
+    /// Number of variables without generated names.
     pub(super) named: usize,
     pub(super) steps: Vec<Step>,
 }
 
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Step {
-    /// Once for each fact that fits what is bound; the rest is bound by it.
+    /// For each fact that matches the bound arguments: binds the others.
     Find { predicate: String, arguments: Vec<Slot>, says: Found },
-    /// Goes on where it is true.
+    /// Continues if the expression is true.
     Test(Expr),
-    /// Gives a variable its value.
+    /// Binds a variable to a value.
     Bind(usize, Expr),
-    /// Goes on where the steps have an answer, or where they have none.
+    /// Continues if the steps have an answer, or (false) if they have none.
     Answers(Vec<Step>, bool),
 }
 
@@ -32,9 +32,9 @@ pub(super) enum Step {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Slot {
     Any,
-    /// Of the variables that an answer gives values to: bound before, or bound by what is found.
+    /// A variable of the answer: bound before, or bound by the fact found.
     Variable(usize),
-    /// Has a value by then.
+    /// Can be evaluated by then.
     Computed(Expr),
 }
 
@@ -45,7 +45,7 @@ pub(super) enum Found {
     Value(Slot),
 }
 
-/// A query that cannot be answered.
+/// Error: a query cannot be answered.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PlanError {
     /// Too many conditions.
@@ -54,7 +54,7 @@ pub enum PlanError {
     /// No condition at all.
     #[error("the query is empty; write a condition, `at(?box) = ?pose`")]
     Empty,
-    /// A variable that only tests use.
+    /// Only tests use a variable.
     #[error("`?{name}` in `{condition}` gets no value: no fact of the query has it as an argument or says it")]
     Unbound {
         /// Its name.
@@ -64,7 +64,7 @@ pub enum PlanError {
     },
 }
 
-/// Plans the answers to conditions. `known` says which variables have values from outside; they are not among the answers'.
+/// Plans a query. `known` tells which variables have values from outside; these are not part of the answers.
 ///
 /// # Errors
 /// [`PlanError`].
@@ -84,7 +84,7 @@ pub fn plan(query: &[Expr], known: &dyn Fn(&str) -> bool) -> Result<Plan, PlanEr
     }
     conditions.iter().for_each(|condition| mentioned(condition, &mut |name| note(&mut order, name)));
     let (named, hidden): (Vec<_>, Vec<_>) = order.into_iter().filter(|n| !known(n)).partition(|n| !n.ends_with('?'));
-    // Those that stand in negations only are bound there and forgotten.
+    // Variables that occur only in negations are bound there and not part of the answers.
     let outside: BTreeSet<&str> = binders(&conditions);
     let (answered, inner): (Vec<_>, Vec<_>) = named.into_iter().partition(|name| outside.contains(name));
     let count = answered.len();
@@ -94,12 +94,12 @@ pub fn plan(query: &[Expr], known: &dyn Fn(&str) -> bool) -> Result<Plan, PlanEr
 }
 
 impl Plan {
-    /// The variables that an answer gives values to, without `?`, in the order of the text.
+    /// The named variables of an answer, without `?`, in the order of the text.
     pub fn variables(&self) -> &[String] {
         &self.variables[..self.named]
     }
 
-    /// The facts that the answers are made of, as far as they are known before any is; those of tests are not among them.
+    /// The facts that answers are made of, as far as they are known before the query runs; facts in tests are not included.
     pub fn patterns(&self) -> Vec<FactPattern> {
         fn of(steps: &[Step], into: &mut Vec<FactPattern>) {
             for step in steps {
@@ -129,12 +129,12 @@ struct Planner<'a> {
 }
 
 impl Planner<'_> {
-    /// The steps of conditions where these variables are bound, and those that are bound after them.
+    /// The steps of conditions, given the bound variables, to which it adds those that it binds.
     fn steps<'c>(&self, conditions: &'c [Condition], bound: &mut BTreeSet<&'c str>) -> Result<Vec<Step>, PlanError> {
         let mut left: Vec<&Condition> = conditions.iter().collect();
         let mut steps = Vec::new();
         while !left.is_empty() {
-            // What only tests goes first; then what finds by most; of equals the first in the text.
+            // Tests go first; then the fact with most bound arguments; among equals the first in the text.
             let ready = |condition: &&Condition| self.is_ready(condition, &left, bound);
             let at = left.iter().position(ready).or_else(|| {
                 let facts =
@@ -195,7 +195,7 @@ impl Planner<'_> {
         (self.known)(name) || bound.contains(name)
     }
 
-    /// Whether a condition that finds nothing can be looked at now.
+    /// Whether a test can be evaluated now.
     fn is_ready<'c>(&self, condition: &'c Condition, left: &[&'c Condition], bound: &BTreeSet<&'c str>) -> bool {
         let has_all = |expr: &'c Expr| unknowns(expr).into_iter().all(|name| self.has(name, bound));
         match condition {
@@ -204,7 +204,7 @@ impl Planner<'_> {
             Condition::Test(expr) if !has_all(expr) => return false,
             Condition::Test(_) | Condition::Answers(..) => {}
         }
-        // A variable of a query within has its value from outside where it stands there, too.
+        // A variable of an inner query that also occurs outside has its value from outside.
         let others = left.iter().filter(|other| !std::ptr::eq(**other, condition));
         let outside: BTreeSet<&str> = others.flat_map(|other| binders(std::slice::from_ref(*other))).collect();
         let mut has_all = true;
@@ -212,7 +212,7 @@ impl Planner<'_> {
         has_all
     }
 
-    /// `?x = value` where nothing gives `?x` its value but this.
+    /// `?x = value`, if nothing else binds `?x`.
     fn binding<'c>(
         &self,
         expr: &'c Expr,
@@ -232,7 +232,7 @@ impl Planner<'_> {
         })
     }
 
-    /// How much of a fact is bound; nothing for one whose arguments cannot be computed yet.
+    /// How well the bound arguments select a fact; `None` if its arguments cannot be computed yet.
     fn score<'c>(&self, condition: &'c Condition, bound: &BTreeSet<&'c str>) -> Option<(bool, usize, usize)> {
         let Condition::Fact(fact, says) = condition else { return None };
         let is_bound = |expr: &Expr| unknowns(expr).into_iter().all(|name| self.has(name, bound));
@@ -282,7 +282,8 @@ fn note<'c>(order: &mut Vec<&'c str>, name: &'c str) {
     }
 }
 
-/// The variables that an expression has no value without: what only a query in it mentions may be that query's own.
+/// The variables without which an expression has no value. A variable that occurs only in an inner query may be that
+/// query's own.
 fn unknowns(expr: &Expr) -> Vec<&str> {
     fn of<'e>(expr: &'e Expr, names: &mut Vec<&'e str>) {
         match expr {
@@ -296,7 +297,7 @@ fn unknowns(expr: &Expr) -> Vec<&str> {
     names
 }
 
-/// The variables in the queries within an expression.
+/// The variables in the queries inside of an expression.
 fn within(expr: &Expr) -> Vec<&str> {
     let mut names = Vec::new();
     expr.visit(&mut |query| {
@@ -325,7 +326,6 @@ fn mentioned<'c>(condition: &'c Condition, visit: &mut dyn FnMut(&'c str)) {
     }
 }
 
-/// The variables that a fact gives values to.
 fn binds<'c>(fact: &'c FactExpr, condition: &'c Condition) -> impl Iterator<Item = &'c str> {
     let value = match condition {
         Condition::Fact(_, Says::Value(value)) => Some(value),
@@ -337,7 +337,7 @@ fn binds<'c>(fact: &'c FactExpr, condition: &'c Condition) -> impl Iterator<Item
     })
 }
 
-/// The variables that get values from these conditions, negations and what is within `exists` aside.
+/// The variables that these conditions bind, except in negations and in `exists`.
 fn binders(conditions: &[Condition]) -> BTreeSet<&str> {
     let mut names = BTreeSet::new();
     for condition in conditions {

@@ -9,30 +9,30 @@ use crate::value::Value;
 use std::borrow::Cow;
 use std::cell::Cell;
 
-/// Whether more is wanted.
+/// Whether the caller wants more answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Flow {
     /// The next answer.
     More,
-    /// No further one.
+    /// Stop.
     Enough,
 }
 
-/// Why a query has no answers, not even none.
+/// Error: the query could not be answered.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RunError {
-    /// Not known yet, or not to be computed.
+    /// A value is not known yet or cannot be computed.
     #[error(transparent)]
     Evaluate(#[from] EvaluateError),
-    /// It would look at too many facts.
+    /// It would visit too many facts.
     #[error(
         "it looks at more than {MAX_STEPS} facts; bind more of its arguments, or begin with the condition that fewest facts fit"
     )]
     TooManySteps,
 }
 
-/// Calls `answer` with the values of [`Plan::variables`] for every answer, as long as more is wanted. One answer may come more than
-/// once, where it can be had in several ways.
+/// Calls `answer` with the values of [`Plan::variables`] for every answer, until it returns [`Flow::Enough`]. An answer is repeated
+/// if it can be derived in several ways.
 ///
 /// # Errors
 /// [`RunError`].
@@ -43,7 +43,7 @@ pub fn run(plan: &Plan, scope: &dyn Scope, answer: &mut dyn FnMut(&[Value]) -> F
     let mut values = Vec::with_capacity(plan.named);
     running.steps(&plan.steps, &mut row, &mut |row| {
         values.clear();
-        // A variable that an answer has no value for is none of a well-formed plan.
+        // Does not occur: in a well-formed plan every answer variable has a value.
         values.extend(row[..plan.named].iter().map(|value| value.clone().unwrap_or(Value::Null)));
         answer(&values)
     })?;
@@ -112,7 +112,7 @@ impl Running<'_> {
             let term = match slot {
                 Slot::Any => None,
                 Slot::Variable(at) => match &row[*at] {
-                    // No fact is about a value that is neither an individual nor an int.
+                    // No fact has an argument that is neither an individual nor an int.
                     Some(value) => match term(value) {
                         Some(term) => Some(term),
                         None => return Ok(Flow::More),
@@ -182,7 +182,7 @@ impl Running<'_> {
         let arguments = free.iter().map(|(position, at)| (*at, of_term(&key.arguments[*position])));
         for (at, value) in arguments.chain(free_value) {
             match &row[at] {
-                // The same variable twice in one fact.
+                // The same variable occurs twice in one fact.
                 Some(before) => fits &= equal(before, &value),
                 None => {
                     row[at] = Some(value);
@@ -211,7 +211,7 @@ fn of_term(term: &Term) -> Value {
     }
 }
 
-/// The scope around a query, with what is bound so far.
+/// The scope around a query, with the variables bound so far.
 struct WithRow<'a> {
     outer: &'a dyn Scope,
     names: &'a [String],

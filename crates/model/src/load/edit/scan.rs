@@ -1,9 +1,9 @@
-//! Where things stand in a YAML text: lines, comments, and the end of a value. It knows quotes and brackets, and no more of YAML than that:
-//! what comes of it is read again and compared.
+//! Positions in a YAML text: lines, comments, and the end of a value. This code knows quotes and brackets, and no other YAML; its results are
+//! verified by parsing again.
 
 use crate::program::Location;
 
-/// A text by lines.
+/// A text, split into lines.
 pub(super) struct Lines<'t> {
     pub(super) text: &'t str,
     starts: Vec<usize>,
@@ -15,7 +15,6 @@ impl<'t> Lines<'t> {
         Lines { text, starts }
     }
 
-    /// The byte of a place.
     pub(super) fn offset(&self, at: Location) -> Option<usize> {
         let line = (at.line as usize).checked_sub(1).filter(|line| *line < self.starts.len())?;
         let column = (at.column as usize).checked_sub(1)?;
@@ -24,43 +23,43 @@ impl<'t> Lines<'t> {
         Some(self.starts[line] + within)
     }
 
-    /// Lines count from 0.
+    /// The line of an offset, counted from 0.
     pub(super) fn line_of(&self, offset: usize) -> usize {
         self.starts.partition_point(|start| *start <= offset).saturating_sub(1)
     }
 
-    /// Where a line begins; the end of the text behind the last.
+    /// The start of a line; the end of the text for a line behind the last.
     pub(super) fn start(&self, line: usize) -> usize {
         self.starts.get(line).copied().unwrap_or(self.text.len())
     }
 
-    /// Where a line ends, without what ends it.
+    /// The end of a line, before its line break.
     pub(super) fn end(&self, line: usize) -> usize {
         self.start(line) + self.content(line).len()
     }
 
-    /// A line without its end; nothing behind the last.
+    /// A line without its line break; empty behind the last line.
     pub(super) fn content(&self, line: usize) -> &'t str {
         self.text[self.start(line)..self.start(line + 1)].trim_end_matches(['\n', '\r'])
     }
 
-    /// How many characters stand before it on its line.
+    /// Number of characters before the offset on its line.
     pub(super) fn column(&self, offset: usize) -> usize {
         self.text[self.start(self.line_of(offset))..offset].chars().count()
     }
 
-    /// Only blanks stand before it on its line.
+    /// Whether only blanks precede the offset on its line.
     pub(super) fn starts_line(&self, offset: usize) -> bool {
         self.text[self.start(self.line_of(offset))..offset].chars().all(|letter| letter == ' ')
     }
 
-    /// What ends the lines.
+    /// The line break of the text.
     pub(super) fn newline(&self) -> &'static str {
         if self.text.contains("\r\n") { "\r\n" } else { "\n" }
     }
 
-    /// Where the value of a key in a column ends: behind the last of the lines that belong to it, before the line `bound`. Comments below its
-    /// last line belong to what follows.
+    /// The end of the value of a key in block style: the end of its last line, before line `bound`. Comments below the value's last line belong
+    /// to the next key.
     pub(super) fn block_end(&self, first: usize, indent: usize, bound: Option<usize>) -> usize {
         let mut last = first;
         for line in first + 1..bound.unwrap_or(self.starts.len()).min(self.starts.len()) {
@@ -71,7 +70,7 @@ impl<'t> Lines<'t> {
                 continue;
             }
             let is_item = depth == indent && (own == "-" || own.starts_with("- "));
-            // No key begins so: it closes a list or mapping in brackets.
+            // It closes a list or mapping in brackets and begins no key.
             let closes = own.starts_with([']', '}']);
             if depth <= indent && !is_item && !closes {
                 break;
@@ -82,16 +81,16 @@ impl<'t> Lines<'t> {
     }
 }
 
-/// What a text consists of.
+/// The kind of text that a character belongs to.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Token {
-    /// Outside of quotes and comments; whether a value can begin here.
+    /// Outside of quotes and comments; true if a value can begin here.
     Plain(bool),
     Quoted,
     Comment,
 }
 
-/// Calls with every character and what it belongs to, until told to stop.
+/// Calls `each` for every character with its kind, until it returns false.
 fn walk(text: &str, mut each: impl FnMut(usize, char, Token) -> bool) {
     let mut quote = None;
     let mut letters = text.char_indices().peekable();
@@ -153,7 +152,7 @@ fn walk(text: &str, mut each: impl FnMut(usize, char, Token) -> bool) {
     }
 }
 
-/// The comments of a text, each from its `#` to the end of its line.
+/// The comments of a text, each from `#` to the end of its line.
 pub(super) fn comments(text: &str) -> Vec<&str> {
     let mut found = Vec::new();
     let mut begun: Option<usize> = None;
@@ -174,24 +173,23 @@ pub(super) fn comments(text: &str) -> Vec<&str> {
     found
 }
 
-/// Whether an anchor, an alias or a merge begins somewhere in it.
+/// Whether the text contains an anchor, an alias or a merge.
 pub fn has_anchor(text: &str) -> bool {
     begins_with(text, ['&', '*'])
 }
 
-/// Whether a tag begins somewhere in it.
+/// Whether the text contains a tag.
 pub fn has_tag(text: &str) -> bool {
     begins_with(text, ['!'; 2])
 }
 
-/// Whether a text over several lines, with `|` or `>` before it, begins somewhere in it, and a quote in it may hide a comment: what is in such a
-/// text are no quotes, which this file does not know.
+/// Whether the text contains a block scalar (`|` or `>`) and a quote that may hide a comment. Quotes in block scalars are plain characters,
+/// which this code does not know.
 pub(super) fn has_hidden_comment(text: &str) -> bool {
     let begins = text.lines().filter(|line| line.starts_with('#') || line.contains(" #") || line.contains("\t#"));
     begins_with(text, ['|', '>']) && begins.count() > comments(text).len()
 }
 
-/// Whether a value begins with one of these somewhere in a text.
 fn begins_with(text: &str, letters: [char; 2]) -> bool {
     let mut found = false;
     walk(text, |_, letter, token| {
@@ -201,7 +199,7 @@ fn begins_with(text: &str, letters: [char; 2]) -> bool {
     found
 }
 
-/// The comma or bracket that ends an entry of a mapping in brackets.
+/// The offset of the comma or bracket that ends an entry in flow style.
 pub(super) fn flow_end(text: &str, from: usize) -> Option<usize> {
     let (mut depth, mut end) = (0_usize, None);
     walk(&text[from..], |at, letter, token| {
@@ -217,7 +215,7 @@ pub(super) fn flow_end(text: &str, from: usize) -> Option<usize> {
     end
 }
 
-/// Where the last character stands that is neither blank nor in a comment, between two places; behind it.
+/// The end of the last character between two offsets that is neither blank nor in a comment.
 pub(super) fn without_comments_end(text: &str, from: usize, to: usize) -> usize {
     let mut end = from;
     walk(&text[from..to], |at, letter, token| {
@@ -229,7 +227,7 @@ pub(super) fn without_comments_end(text: &str, from: usize, to: usize) -> usize 
     end
 }
 
-/// Text as a scalar that reads as it wherever it stands: plain where that is safe, else in quotes.
+/// The text as a scalar that is parsed as this text anywhere: plain if that is safe, else quoted.
 pub(super) fn scalar(text: &str) -> String {
     let is_plain = |letter: char| letter.is_ascii_alphanumeric() || " _$.()=+/<>?".contains(letter);
     let begins = text.starts_with(|letter: char| letter.is_ascii_alphabetic() || letter == '_' || letter == '$');

@@ -36,7 +36,7 @@ fn examples() -> Vec<(String, String)> {
     found
 }
 
-/// A program without what moves with the lines of its file.
+/// A program without its locations, which change with the lines of the file.
 fn program(text: &str) -> Option<Program> {
     let files = Here(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples"));
     let mut program = load_with(text, "t.yaml", &Catalogue::standard(), &files).ok()?.program;
@@ -45,7 +45,7 @@ fn program(text: &str) -> Option<Program> {
     Some(program)
 }
 
-/// How many lines are the same at the beginning and at the end.
+/// Number of equal lines at the beginning and at the end.
 fn frame(old: &str, new: &str) -> (usize, usize) {
     let (old, new): (Vec<&str>, Vec<&str>) = (old.split('\n').collect(), new.split('\n').collect());
     let most = old.len().min(new.len());
@@ -54,7 +54,7 @@ fn frame(old: &str, new: &str) -> (usize, usize) {
     (head, tail)
 }
 
-/// Values that a key may have, short and long ones, in other words than any example.
+/// Values that a key may have, short and long ones, different from those of the examples.
 fn values(key: &str) -> Vec<Option<Document>> {
     let texts: &[&str] = match key {
         "computes" | "pia" | "deterministic" | "routine" => &["true", "false"],
@@ -77,11 +77,11 @@ fn values(key: &str) -> Vec<Option<Document>> {
     texts.iter().map(|text| Some(value(text))).chain([None]).collect()
 }
 
-/// So many changes are loaded: one of these.
+/// One of this many changes is also loaded.
 const EVERY: usize = 17;
 
-/// Over every example, every state, every key that it has, some that it may have, and some values by turns (`RATN_EDIT_EXHAUSTIVE=1`: all of them): the tree is the old one with the change alone, all
-/// lines but those of the key are the same, all comments are there, and where it loads nothing but this state is otherwise.
+/// For every example, every state, every key that it has, some keys that it may have, and some values in turn (`RATN_EDIT_EXHAUSTIVE=1`: all of them): the new
+/// tree is the old one with only this change, all other lines and all comments are unchanged, and if it loads, only this state differs.
 #[test]
 fn only_the_lines_of_the_key_change_in_every_state_of_every_example() {
     let is_exhaustive = std::env::var_os("RATN_EDIT_EXHAUSTIVE").is_some();
@@ -101,7 +101,7 @@ fn only_the_lines_of_the_key_change_in_every_state_of_every_example() {
                 };
                 let all: Vec<Option<Document>> = values(key).into_iter().chain(more).collect();
                 turn += 1;
-                // Of keys that are new every second one is enough.
+                // Every second new key is enough.
                 if old.is_none() && turn % 2 == 0 && !is_exhaustive {
                     continue;
                 }
@@ -123,7 +123,7 @@ fn only_the_lines_of_the_key_change_in_every_state_of_every_example() {
                     all.sort_unstable();
                     kept.sort_unstable();
                     assert_eq!(all, kept, "{place}");
-                    // What is between the lines that are the same is of this key.
+                    // Lines that differ belong to this key.
                     let (head, tail) = frame(&text, &after);
                     let lines: Vec<&str> = text.split('\n').collect();
                     let between = &lines[head..lines.len() - tail];
@@ -133,13 +133,13 @@ fn only_the_lines_of_the_key_change_in_every_state_of_every_example() {
                         let first = lines[..=head].iter().rposition(|line| line.contains(&format!("{key}:"))).unwrap();
                         assert!(first as u32 + 1 >= state.location.line, "{place}: {between:?}");
                     }
-                    // And back again: to what it was for the loader, whatever the layout.
+                    // And back: the loader sees the old file again, whatever the layout.
                     let back = edited(&after, &state.path, key, old.as_ref())
                         .unwrap_or_else(|error| panic!("{place}, back: {error}"));
                     if old.is_none() {
                         assert_eq!(back, text, "{place}: what was added is taken away without a trace");
                     }
-                    // Loading takes long where nothing is optimized: of some. That the trees are as they should be is known of all.
+                    // Loading is slow without optimization, so only some are loaded. The trees have been compared for all.
                     if done % EVERY != 0 {
                         continue;
                     }
@@ -147,7 +147,7 @@ fn only_the_lines_of_the_key_change_in_every_state_of_every_example() {
                     let Some(mut other) = program(&after) else { continue };
                     loaded += 1;
                     for (one, other) in before.states.iter().zip(&mut other.states) {
-                        // What a state says of exceptions counts for those inside, too.
+                        // `exceptions` of a state also hold for the states inside.
                         let is_inside = one.path.starts_with(&format!("{}/", state.path));
                         if one.path == state.path
                             || one.path == format!("{}/try", state.path)
@@ -332,7 +332,7 @@ fn what_cannot_be_done_safely_is_refused_with_what_where_why_and_what_next() {
     `for_x` cannot have `senses`: a state with `for: x in [1]` may say reads, resources, duration, routine, exceptional, exceptions, shared
     line 1: unclosed bracket '[': the file cannot be read as a task; correct it in an editor first
     ");
-    // What stands in a case has a text of its own.
+    // A state in a case has a text of its own.
     assert!(edited(switch, "w/else/go", "duration", Some(&value("7"))).is_ok());
 }
 
@@ -344,7 +344,7 @@ fn merged_keys_are_left_alone() {
     }
 }
 
-/// The files of the reference are written in every way that there is.
+/// The task files in the reference use every form.
 #[test]
 fn in_every_task_of_the_reference_a_key_is_added_changed_and_taken_away_or_it_is_said_why_not() {
     let reference = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/task-files.md");

@@ -1,28 +1,28 @@
 //! Ontologies of several files: `[] a owl:Ontology ; owl:imports <base.ttl> , "../shared/robot.ttl"`.
 //!
-//! What a file imports is read before it, each file once, and all of it is one ontology. Bounded: by the number of files and by how
-//! deep they import each other; a file that imports itself, directly or over others, is refused.
+//! Imported files are read before the file that imports them, each file once; together they form one ontology. The number of files and
+//! the depth of imports are limited; circular imports are refused.
 
 use super::{OWL, OntologyError, Statements, assemble, parse, wrong};
 use crate::ontology::Ontology;
 use oxrdf::Term as Node;
 use std::collections::BTreeSet;
 
-/// An ontology is of no more files.
+/// Limit of the files of an ontology.
 pub const MAX_FILES: usize = 32;
-/// Files import each other no deeper.
+/// Limit of the depth of imports.
 pub const MAX_DEPTH: usize = 8;
-/// What a relative IRI stands for, before it is one of a file.
+/// Base for relative IRIs, before they are resolved to files.
 pub(super) const BASE: &str = "file:///";
 
-/// Where the texts of imported files come from: of the file that imports and what it calls the other, the other's name, by which it is
-/// known again, and its text; or why it cannot be read.
+/// Reads an imported file, given the importing file and the name in the import. Returns the file's name, which identifies it, and its
+/// text; or why it cannot be read.
 pub type ReadFile<'a> = &'a dyn Fn(&str, &str) -> Result<(String, String), String>;
 
-/// Reads an ontology with all that it imports; its texts, too, one after the other.
+/// Reads an ontology with all its imports; also returns all its texts, one after the other.
 ///
 /// # Errors
-/// [`OntologyError`] for the first thing that is wrong; in an imported file with its name.
+/// [`OntologyError`] for the first error; one in an imported file has the file's name.
 pub fn read_with(name: &str, text: &str, files: ReadFile<'_>) -> Result<(Ontology, String), OntologyError> {
     let mut reading = Reading {
         files,
@@ -40,7 +40,7 @@ struct Reading<'a> {
     statements: Statements,
     texts: String,
     known: BTreeSet<String>,
-    /// The files that import each other, the first first.
+    /// The chain of importing files, the outermost first.
     above: Vec<String>,
 }
 
@@ -79,7 +79,7 @@ impl Reading<'_> {
     }
 }
 
-/// What a file imports, in the order of its text.
+/// The imports of a file, in the order of its text.
 fn imported(statements: &Statements) -> Result<Vec<String>, OntologyError> {
     let imports = format!("{OWL}imports");
     let all = statements.iter().flat_map(|(subject, said)| said.iter().map(move |said| (subject, said)));
@@ -87,7 +87,7 @@ fn imported(statements: &Statements) -> Result<Vec<String>, OntologyError> {
     wanted.map(|(subject, (_, object))| path(object).ok_or_else(|| not_a_file(subject, object))).collect()
 }
 
-/// The path of a file that is relative to the one that names it.
+/// The path of a file, relative to the importing one.
 fn path(object: &Node) -> Option<String> {
     match object {
         Node::NamedNode(iri) => iri.as_str().strip_prefix(BASE).map(str::to_owned),

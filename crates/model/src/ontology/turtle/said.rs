@@ -1,15 +1,15 @@
-//! What a predicate may say beside its arguments and its value.
+//! Further properties of a predicate, besides its arguments and its value.
 //!
 //! | | |
 //! |---|---|
-//! | `a owl:FunctionalProperty` | of the facts that differ in the last argument only, one holds at most |
-//! | `ratn:tolerance 0.05` | numbers and joint positions that differ by no more are the same fact |
-//! | `ratn:positionTolerance 0.01` | so are poses whose origins are no more metres apart |
-//! | `ratn:angleTolerance 0.1` | and whose rotations differ by no more radians |
-//! | `ratn:geometric true` | its facts make the scene |
-//! | `ratn:ttl 30` | a measured fact is stale after so many seconds |
-//! | `ratn:uncertainty "confidence"` | or `"covariance"`: what measured facts carry |
-//! | `ratn:unit "kg"` | of its numbers |
+//! | `a owl:FunctionalProperty` | among the facts that differ in the last argument only, at most one holds |
+//! | `ratn:tolerance 0.05` | numbers and joint positions within this difference count as the same |
+//! | `ratn:positionTolerance 0.01` | so do poses whose origins are within this distance in metres |
+//! | `ratn:angleTolerance 0.1` | and whose rotations differ by at most this angle in radians |
+//! | `ratn:geometric true` | the scene is derived from its facts |
+//! | `ratn:ttl 30` | a measured fact is stale after this number of seconds |
+//! | `ratn:uncertainty "confidence"` | or `"covariance"`: the certainty of measured facts |
+//! | `ratn:unit "kg"` | the unit of its numbers |
 
 use super::{Domain, OntologyError, Predicate, Range, literal, wrong};
 use crate::ontology::Uncertainty;
@@ -17,7 +17,7 @@ use crate::tolerance::Deviation;
 use crate::value::Type;
 use oxrdf::Term as Node;
 
-/// The longest name of a unit, in characters.
+/// Limit of a unit's name, in characters.
 const MAX_UNIT: usize = 32;
 
 #[derive(Default)]
@@ -30,7 +30,7 @@ pub(super) struct More {
 }
 
 impl More {
-    /// Takes what is said by a property of ours; whether there is such a property.
+    /// Stores the value of one of these properties; false if there is no such property.
     pub(super) fn takes(&mut self, subject: &str, what: &str, object: &Node) -> Result<bool, OntologyError> {
         let text = || literal(subject, &format!("ratn:{what}"), object);
         let number = || {
@@ -81,7 +81,7 @@ impl More {
         Ok(true)
     }
 
-    /// The predicate, where what is said of it fits its value.
+    /// The predicate, if its properties fit its value.
     pub(super) fn predicate(
         self,
         subject: &str,
@@ -117,7 +117,7 @@ impl More {
     }
 }
 
-/// Whether a value of the type may hold a value of one of these.
+/// Whether a value of the type may contain a value of one of these types.
 fn holds(ty: &Type, of: &[Type]) -> bool {
     match ty {
         Type::Any => true,

@@ -1,7 +1,8 @@
-//! The environments of a window as forms. Neighbours share nearly all of theirs, and so do the forms: frames, variables, lists of
-//! loops and nodes of tables are written once.
+//! The serialized environments of a window. Neighbouring environments share nearly everything, and so do their forms: frames,
+//! variables, lists of loops and nodes of tables are written once.
 //!
-//! Of a producer it is more than room: its outputs are set once for all who can name it, so there must be one of it again.
+//! For a producer, sharing is more than a saving: its outputs are set once for all who refer to it, so it must be restored as one
+//! value.
 
 use super::{Binding, Environment, Frame, Iteration, Link, Producer, Variables};
 use crate::binding::Outputs;
@@ -15,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::sync::{Arc, OnceLock};
 
-/// All environments of a window and the producers that are named beside them, each in the order in which the window visits them.
+/// All environments of a window and the producers beside them, each in the order in which the window visits them.
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct Places<'a> {
     shared: Shared<'a>,
@@ -73,7 +74,7 @@ enum BindingForm<'a> {
     Assigned(u32),
 }
 
-/// Collects what a window shares.
+/// Collects the shared parts of a window.
 #[derive(Default)]
 pub(crate) struct Collector<'a> {
     known: Known<'a>,
@@ -155,7 +156,7 @@ impl<'a> Known<'a> {
     }
 
     fn frame(&mut self, frame: &'a Arc<Frame>) -> u32 {
-        // From the inside out as far as it is new, and back: what is below stands before.
+        // From the innermost new frame outwards, then back: a frame is written after the frame below it.
         let mut new = Vec::new();
         let mut at = Some(frame);
         while let Some(frame) = at.filter(|frame| self.frames.find(frame).is_none()) {
@@ -181,7 +182,7 @@ impl<'a> Known<'a> {
     }
 }
 
-/// What was read, to be given back in the order in which it was collected.
+/// Restored parts, returned in the order in which they were collected.
 pub(crate) struct Restored {
     environments: std::vec::IntoIter<Environment>,
     producers: std::vec::IntoIter<Arc<Producer>>,
@@ -196,7 +197,7 @@ impl Restored {
         self.producers.next().ok_or("fewer producers than places")
     }
 
-    /// Nothing is left over.
+    /// Checks that all parts were used.
     pub(crate) fn finish(self) -> Result<(), Broken> {
         let is_over = self.environments.as_slice().is_empty() && self.producers.as_slice().is_empty();
         if is_over { Ok(()) } else { Err("more environments than places") }

@@ -1,22 +1,22 @@
-//! Tables as forms: every node that tables share is written once, what it leads to before it.
+//! Serialized tables: every node that tables share is written once, after its children.
 
 use super::{Node, Table, WIDTH};
 use crate::checkpoint::{Broken, Pool, at};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// A node of a tree, by the places of others.
+/// A node of a tree; its children are given by their places.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(in super::super) enum NodeForm<T> {
     Leaf([Option<T>; WIDTH]),
     Inner([Option<u32>; WIDTH]),
 }
 
-/// Nodes that were read, each with its level above the leaves.
+/// The nodes read so far, each with its level above the leaves.
 pub(in super::super) struct Nodes<T>(Vec<(usize, Arc<Node<T>>)>);
 
 impl<T: Clone> Table<T> {
-    /// The place of the root, of a table that is not empty.
+    /// The place of the root; `None` for an empty table.
     pub(in super::super) fn form<'a, U>(
         &'a self,
         pool: &mut Pool<NodeForm<U>>,
@@ -25,7 +25,7 @@ impl<T: Clone> Table<T> {
         self.root.as_ref().map(|root| place(root, pool, of))
     }
 
-    /// A table of the size of an empty one, whose root is at a place.
+    /// Restores a table of the size of `empty` from the place of its root.
     pub(in super::super) fn of_form(empty: Table<T>, root: Option<u32>, nodes: &Nodes<T>) -> Result<Table<T>, Broken> {
         let mut table = empty;
         if let Some(root) = root {
