@@ -4,10 +4,11 @@
 //! arm with more joints is solved for each place of those that are left over: an arm on a column for a height of the column, one of
 //! seven joints whose wrist is not spherical for a turn of one joint.
 
-use crate::frame::{compose, rotate};
+use crate::frame::compose;
 use crate::joint_vector::JointVector;
 use crate::robot_model::{Drive, Joint};
 use crate::six::{Axis, Kind};
+use crate::vector::{Vector, position, rotate};
 use ratn_model::pose::Pose;
 use std::f64::consts::TAU;
 
@@ -100,12 +101,12 @@ impl ClosedForm {
 
 /// The axes of the solved joints where these are at zero, and the frame of the last joint.
 fn axes(chain: &[(Pose, Drive)], solved: &[usize; 6], held: &JointVector) -> ([Axis; 6], Pose) {
-    let mut axes = [Axis { direction: [0.0; 3], point: [0.0; 3] }; 6];
+    let mut axes = [Axis { direction: Vector::ZERO, point: Vector::ZERO }; 6];
     let (mut pose, mut next) = (Pose::IDENTITY, 0);
     for (place, (origin, drive)) in chain.iter().enumerate() {
         pose = compose(&pose, origin);
         if solved.contains(&place) {
-            axes[next] = Axis { direction: rotate(&pose, drive.axis), point: pose.position };
+            axes[next] = Axis { direction: rotate(&pose, drive.axis), point: position(&pose) };
             next += 1;
         } else {
             pose = compose(&pose, &drive.moved(held[drive.joint]));

@@ -6,10 +6,10 @@
 //! Kosuge: *Analytical Inverse Kinematic Computation for 7-DOF Redundant Manipulators With Joint Limits and Its Application to
 //! Redundancy Resolution*, IEEE T-RO 24(5), 2008). A pose that can be reached at all is found this way, however small the arc.
 
-use crate::frame::{cross, rotate};
 use crate::joint_vector::JointVector;
 use crate::robot::Joint;
-use crate::spherical::{Spherical, about, dot};
+use crate::spherical::{Spherical, about};
+use crate::vector::rotate;
 use ratn_model::pose::Pose;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -84,21 +84,21 @@ fn cuts(arm: &Spherical, target: &Pose, bend: f64, limits: &[Joint]) -> Vec<f64>
             cuts.extend(zeros(at_quarter - constant, cosine, constant));
         };
         for limit in limits(0) {
-            let seen = cross(a, rotate(&about(a, limit), cross(a, b)));
-            cut(&|rotation| dot(seen, rotate(rotation, c)));
+            let seen = a.cross(rotate(&about(a, limit), a.cross(b)));
+            cut(&|rotation| seen.dot(rotate(rotation, c)));
         }
         for limit in limits(2) {
-            let seen = cross(c, rotate(&about(c, -limit), cross(c, b)));
-            cut(&|rotation| dot(seen, rotate(&rotation.inverse(), a)));
+            let seen = c.cross(rotate(&about(c, -limit), c.cross(b)));
+            cut(&|rotation| seen.dot(rotate(&rotation.inverse(), a)));
         }
         for limit in limits(1) {
-            let seen = dot(a, rotate(&about(b, limit), c));
-            cut(&|rotation| dot(a, rotate(rotation, c)) - seen);
+            let seen = a.dot(rotate(&about(b, limit), c));
+            cut(&|rotation| a.dot(rotate(rotation, c)) - seen);
         }
         // Where the outer axes are in line the two ways to make a rotation change over.
-        let size = dot(a, c).hypot(dot(a, cross(b, c)));
+        let size = a.dot(c).hypot(a.dot(b.cross(c)));
         for seen in [size, -size] {
-            cut(&|rotation| dot(a, rotate(rotation, c)) - seen);
+            cut(&|rotation| a.dot(rotate(rotation, c)) - seen);
         }
     }
     cuts.push(0.0);

@@ -88,6 +88,7 @@ mod urdf;
 mod urdf_faults;
 mod urdf_tree;
 pub mod validate;
+mod vector;
 pub mod way_points;
 pub mod workplace;
 mod xml_text;

@@ -6,12 +6,13 @@
 //! that ends early and the arm is redundant, other postures of the same poses are tried (`ladder`). The result is the whole line or an error, which says how
 //! far the nearest postures get and which joint ends the line. Works for any robot.
 
-use crate::frame::{compose, difference, norm};
+use crate::frame::compose;
 use crate::joint_vector::JointVector;
 use crate::ladder;
 use crate::pace::{Control, Stop};
 use crate::reach::{Reach, Target, rotation_vector};
 use crate::robot_model::Joint;
+use crate::vector::{Vector, position};
 use ratn_model::pose::Pose;
 use std::fmt;
 
@@ -346,37 +347,36 @@ impl Curve {
 #[derive(Debug, Clone, Copy)]
 struct Leg {
     from: Pose,
-    way: [f64; 3],
+    way: Vector,
     /// A rotation vector.
-    turn: [f64; 3],
+    turn: Vector,
 }
 
 impl Leg {
     fn new(from: Pose, to: Pose) -> Leg {
         let turn = rotation_vector(&compose(&to, &from.inverse()));
-        Leg { from, way: difference(to.position, from.position), turn }
+        Leg { from, way: position(&to) - position(&from), turn }
     }
 
     fn length_m(&self) -> f64 {
-        norm(self.way)
+        self.way.length()
     }
 
     fn turn_rad(&self) -> f64 {
-        norm(self.turn)
+        self.turn.length()
     }
 
     /// The pose at a share of the line.
     fn at(&self, share: f64) -> Pose {
-        let turned = compose(&turned_by(self.turn.map(|c| c * share)), &self.from);
-        Pose { position: std::array::from_fn(|i| self.from.position[i] + share * self.way[i]), ..turned }
+        let turned = compose(&turned_by(self.turn * share), &self.from);
+        Pose { position: (position(&self.from) + share * self.way).into(), ..turned }
     }
 }
 
 /// The rotation by a rotation vector.
-fn turned_by(vector: [f64; 3]) -> Pose {
-    let angle = norm(vector);
+fn turned_by(vector: Vector) -> Pose {
+    let angle = vector.length();
     // Near zero the sine of half the angle is about half the angle.
     let scale = if angle > 1e-9 { (angle / 2.0).sin() / angle } else { 0.5 };
-    let [x, y, z] = vector.map(|c| c * scale);
-    Pose { position: [0.0; 3], quaternion_xyzw: [x, y, z, (angle / 2.0).cos()] }
+    Pose { position: [0.0; 3], quaternion_xyzw: (vector * scale).extend((angle / 2.0).cos()).into() }
 }

@@ -9,12 +9,13 @@
 
 use crate::closed_form::ClosedForm;
 use crate::elbow::{self, Arc};
-use crate::frame::{compose, cross, difference, norm, rotate};
+use crate::frame::compose;
 use crate::joint_vector::JointVector;
 use crate::levers::{Chain, Levers};
 use crate::mechanism::{MAX_JOINTS, Mechanism};
 use crate::robot_model::{Drive, Joint};
 use crate::spherical::Spherical;
+use crate::vector::{Vector, position, rotate, unit};
 use rand::{Rng, RngExt};
 use ratn_model::pose::Pose;
 use std::f64::consts::PI;
@@ -90,8 +91,7 @@ impl Target {
         let off = self.off(have);
         let about_z = self.tolerance_rad[2] >= PI;
         let turn = if about_z {
-            let axis = rotate(have, [0.0, 0.0, 1.0]);
-            rotate(&inverse, between_directions(axis, rotate(&self.pose, [0.0, 0.0, 1.0])))
+            rotate(&inverse, between_directions(rotate(have, Vector::Z), rotate(&self.pose, Vector::Z)))
         } else {
             rotate(&inverse, rotation_vector(&compose(&self.pose, &have.inverse())))
         };
@@ -99,22 +99,21 @@ impl Target {
             let tolerance = tolerance * share;
             if value.abs() <= tolerance { 0.0 } else { value - value.signum() * tolerance }
         };
-        let off: [f64; 3] = std::array::from_fn(|i| beyond(off[i], self.tolerance_m[i]));
-        let turn: [f64; 3] = if about_z {
-            let turn = [turn[0], turn[1], 0.0];
-            let (angle, tolerance) = (norm(turn), self.tolerance_rad[0].min(self.tolerance_rad[1]) * share);
-            turn.map(|t| if angle <= tolerance { 0.0 } else { t * (angle - tolerance) / angle })
+        let off = Vector::from_array(std::array::from_fn(|i| beyond(off[i], self.tolerance_m[i])));
+        let turn = if about_z {
+            let turn = Vector::new(turn.x, turn.y, 0.0);
+            let (angle, tolerance) = (turn.length(), self.tolerance_rad[0].min(self.tolerance_rad[1]) * share);
+            if angle <= tolerance { Vector::ZERO } else { turn * ((angle - tolerance) / angle) }
         } else {
-            std::array::from_fn(|i| beyond(turn[i], self.tolerance_rad[i]))
+            Vector::from_array(std::array::from_fn(|i| beyond(turn[i], self.tolerance_rad[i])))
         };
-        let ([x, y, z], [i, j, k]) = (off, turn);
-        [x, y, z, i, j, k]
+        [off.x, off.y, off.z, turn.x, turn.y, turn.z]
     }
 
     /// The vector from a pose to the centre of the position tolerances, in their axes.
-    fn off(&self, have: &Pose) -> [f64; 3] {
+    fn off(&self, have: &Pose) -> Vector {
         let middle = self.bounds.as_ref().unwrap_or(&self.pose);
-        rotate(&middle.inverse(), difference(middle.position, have.position))
+        rotate(&middle.inverse(), position(middle) - position(have))
     }
 
     /// How far the frame may move from a pose, in metres, and rotate, in radians, within the tolerances; negative outside of them.
@@ -122,8 +121,7 @@ impl Target {
         let off = self.off(have);
         let left_m = (0..3).map(|i| self.tolerance_m[i] - off[i].abs()).fold(f64::INFINITY, f64::min);
         let left_rad = if self.tolerance_rad[2] >= PI {
-            let up = [0.0, 0.0, 1.0];
-            let turn = norm(between_directions(rotate(have, up), rotate(&self.pose, up)));
+            let turn = between_directions(rotate(have, Vector::Z), rotate(&self.pose, Vector::Z)).length();
             self.tolerance_rad[0].min(self.tolerance_rad[1]) - turn
         } else {
             let turn = rotate(&self.pose.inverse(), rotation_vector(&compose(&self.pose, &have.inverse())));
@@ -198,8 +196,8 @@ impl Postures {
 
 /// A joint's axis in the root's frame.
 struct Axis {
-    direction: [f64; 3],
-    point: [f64; 3],
+    direction: Vector,
+    point: Vector,
     drive: Drive,
 }
 
@@ -245,7 +243,7 @@ impl Reach {
         let (axes, tip) = self.axes(positions);
         let rows = jacobian(&axes, &tip, &[Pose::IDENTITY; 2], [true; 6]);
         let along = |row: usize| (0..self.joints.len()).map(|j| rows[row][j] * velocities[j]).sum::<f64>();
-        [norm([along(0), along(1), along(2)]), norm([along(3), along(4), along(5)])]
+        [0, 3].map(|first| Vector::new(along(first), along(first + 1), along(first + 2)).length())
     }
 
     /// The nearest positions within the limits.
@@ -273,7 +271,7 @@ impl Reach {
             let error = target.error(&tip, INNER);
             let views = [target.bounds.as_ref().unwrap_or(&target.pose), &target.pose].map(Pose::inverse);
             let mut rows = jacobian(&axes, &tip, &views, target.minds(&error));
-            let (off, turned) = (norm([error[0], error[1], error[2]]), norm([error[3], error[4], error[5]]));
+            let [off, turned] = [0, 3].map(|first| Vector::from_slice(&error[first..]).length());
             // Far from the target, heavy damping keeps the descent steady; close to it the step is nearly Newton's.
             let damping = f64::clamp(1e-3 * (off + turned), 1e-9, 1e-3);
             let mut step = damped_step(&rows, &error, damping, self.joints.len())?;
@@ -503,7 +501,7 @@ impl Reach {
         let mut pose = Pose::IDENTITY;
         for (origin, drive) in &self.chain {
             pose = compose(&pose, origin);
-            axes.push(Axis { direction: rotate(&pose, drive.axis), point: pose.position, drive: *drive });
+            axes.push(Axis { direction: rotate(&pose, drive.axis), point: position(&pose), drive: *drive });
             pose = compose(&pose, &drive.moved(positions[drive.joint]));
         }
         (axes, compose(&pose, &self.tip))
@@ -515,10 +513,11 @@ fn jacobian(axes: &[Axis], tip: &Pose, views: &[Pose; 2], minded: [bool; 6]) -> 
     let mut rows = [[0.0; MAX_JOINTS]; 6];
     for Axis { direction, point, drive } in axes {
         let (linear, angular) = match drive.slides {
-            true => (*direction, [0.0; 3]),
-            false => (cross(*direction, difference(tip.position, *point)), *direction),
+            true => (*direction, Vector::ZERO),
+            false => (direction.cross(position(tip) - *point), *direction),
         };
-        let values = rotate(&views[0], linear).into_iter().chain(rotate(&views[1], angular));
+        let values =
+            [rotate(&views[0], linear), rotate(&views[1], angular)].map(<[f64; 3]>::from).into_iter().flatten();
         for ((row, value), _) in rows.iter_mut().zip(values).zip(minded).filter(|(_, minded)| *minded) {
             // A joint may move several links of a chain.
             row[drive.joint] += value * drive.factor;
@@ -543,28 +542,28 @@ pub fn distance(a: &JointVector, b: &JointVector) -> f64 {
 }
 
 /// The axis of a rotation times its angle, at most half a turn.
-pub(crate) fn rotation_vector(rotation: &Pose) -> [f64; 3] {
+pub(crate) fn rotation_vector(rotation: &Pose) -> Vector {
     let turn = rotation.quaternion_xyzw;
     let [i, j, k, w] = if turn[3] < 0.0 { turn.map(|c| -c) } else { turn };
-    let sine = norm([i, j, k]);
+    let axis = Vector::new(i, j, k);
+    let sine = axis.length();
     // Near zero the angle is about twice the sine of its half.
     let scale = if sine > 1e-9 { 2.0 * sine.atan2(w) / sine } else { 2.0 };
-    [i * scale, j * scale, k * scale]
+    axis * scale
 }
 
 /// The shortest rotation from one direction to another, as a rotation vector; for opposite directions about any axis.
-fn between_directions(from: [f64; 3], to: [f64; 3]) -> [f64; 3] {
-    let axis = cross(from, to);
-    let (sine, cosine) = (norm(axis), (0..3).map(|i| from[i] * to[i]).sum::<f64>());
+fn between_directions(from: Vector, to: Vector) -> Vector {
+    let axis = from.cross(to);
+    let (sine, cosine) = (axis.length(), from.dot(to));
     if sine > 1e-12 {
-        return axis.map(|c| c * sine.atan2(cosine) / sine);
+        return axis * (sine.atan2(cosine) / sine);
     }
     if cosine > 0.0 {
-        return [0.0; 3];
+        return Vector::ZERO;
     }
-    let aside = if from[0].abs() < 0.9 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] };
-    let axis = cross(from, aside);
-    axis.map(|c| c * PI / norm(axis))
+    let aside = if from.x.abs() < 0.9 { Vector::X } else { Vector::Y };
+    unit(from.cross(aside)) * PI
 }
 
 /// Jᵀ (J Jᵀ + λ I)⁻¹ e; `None` where the system is singular.

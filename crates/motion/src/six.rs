@@ -6,8 +6,9 @@
 //! Murray, Li, Sastry: *A Mathematical Introduction to Robotic Manipulation*, 3.3; Elias and Wen: *IK-Geo*, 2022, for which arms decompose in this way). Joint
 //! limits, and the choice among the turns of a joint, are left to the caller.
 
-use crate::frame::{compose, cross, difference, norm, rotate};
-use crate::spherical::{Vector, about, angle_about, dot};
+use crate::frame::compose;
+use crate::spherical::{about, angle_about};
+use crate::vector::{Vector, rotate, transform};
 use ratn_model::pose::Pose;
 use std::f64::consts::TAU;
 
@@ -95,12 +96,12 @@ impl Shape {
 }
 
 fn shape(axes: &[Axis; 6], within: f64) -> Option<Shape> {
-    let parallel = |a: usize, b: usize| norm(cross(axes[a].direction, axes[b].direction)) < within;
+    let parallel = |a: usize, b: usize| axes[a].direction.cross(axes[b].direction).length() < within;
     let meet = |a: usize, b: usize| !parallel(a, b) && between(&axes[a], &axes[b]).is_some_and(|(_, gap)| gap < within);
     let wrist = meet(3, 4)
         && !parallel(4, 5)
         && between(&axes[3], &axes[4])
-            .is_some_and(|(point, _)| norm(cross(difference(point, axes[5].point), axes[5].direction)) < within);
+            .is_some_and(|(point, _)| (point - axes[5].point).cross(axes[5].direction).length() < within);
     if wrist && meet(0, 1) {
         return Some(Shape::WristAndShoulder);
     }
@@ -115,30 +116,30 @@ fn shape(axes: &[Axis; 6], within: f64) -> Option<Shape> {
 fn reversed(axes: &[Axis; 6]) -> [Axis; 6] {
     std::array::from_fn(|i| {
         let Axis { direction, point } = axes[5 - i];
-        Axis { direction: direction.map(|c| -c), point }
+        Axis { direction: -direction, point }
     })
 }
 
 /// The first three joints move the wrist to its position, the last three orient it.
 fn solve_wrist(shape: Shape, axes: &[Axis; 6], motion: &Pose, found: &mut Solutions) {
     let Some((wrist, _)) = between(&axes[3], &axes[4]) else { return };
-    let target = motion.transform(wrist);
+    let target = transform(motion, wrist);
     let mut places: Vec<[f64; 3]> = Vec::new();
     if shape == Shape::WristAndShoulder {
         let Some((shoulder, _)) = between(&axes[0], &axes[1]) else { return };
-        let seen = difference(target, shoulder);
-        for third in found.distances(&axes[2], wrist, shoulder, norm(seen)) {
-            let bent = difference(turned(&axes[2], third, wrist), shoulder);
+        let seen = target - shoulder;
+        for third in found.distances(&axes[2], wrist, shoulder, seen.length()) {
+            let bent = turned(&axes[2], third, wrist) - shoulder;
             let [first, second] = [axes[0].direction, axes[1].direction];
-            for middle in found.angles(wave(second, bent, first), dot(first, seen)) {
+            for middle in found.angles(wave(second, bent, first), first.dot(seen)) {
                 let outer = angle_about(first, rotate(&about(second, middle), bent), seen);
                 places.push([outer, middle, third]);
             }
         }
     } else {
         let along = axes[1].direction;
-        let seen = difference(target, axes[0].point);
-        let wanted = dot(along, difference(wrist, axes[0].point));
+        let seen = target - axes[0].point;
+        let wanted = along.dot(wrist - axes[0].point);
         for back in found.angles(wave(axes[0].direction, seen, along), wanted) {
             let target = turned(&axes[0], back, target);
             let rest = found.two_parallel(&axes[1], &axes[2], wrist, target);
@@ -158,17 +159,17 @@ fn solve_wrist(shape: Shape, axes: &[Axis; 6], motion: &Pose, found: &mut Soluti
 fn solve_three_parallel(axes: &[Axis; 6], motion: &Pose, found: &mut Solutions) {
     let Some((wrist, _)) = between(&axes[4], &axes[5]) else { return };
     let along = axes[1].direction;
-    let target = motion.transform(wrist);
-    let wanted = dot(along, difference(wrist, axes[0].point));
+    let target = transform(motion, wrist);
+    let wanted = along.dot(wrist - axes[0].point);
     let [fifth, sixth] = [axes[4].direction, axes[5].direction];
     // Parallel axes may point in opposite directions.
-    let [third_sign, fourth_sign] = [2, 3].map(|i: usize| dot(axes[i].direction, along).signum());
-    for back in found.angles(wave(axes[0].direction, difference(target, axes[0].point), along), wanted) {
+    let [third_sign, fourth_sign] = [2, 3].map(|i: usize| axes[i].direction.dot(along).signum());
+    for back in found.angles(wave(axes[0].direction, target - axes[0].point, along), wanted) {
         let rest = compose(&exponential(&axes[0], back), motion);
         let seen = rotate(&rest, sixth);
-        for e in found.angles(wave(fifth, sixth, along), dot(along, seen)) {
+        for e in found.angles(wave(fifth, sixth, along), along.dot(seen)) {
             let tilted = rotate(&about(fifth, e), sixth);
-            let in_line = norm(cross(along, tilted)) < SLACK;
+            let in_line = along.cross(tilted).length() < SLACK;
             // If the last axis is in line with the three parallel ones it rotates as they do, so that any division of the angle is right.
             found.is_singular |= in_line;
             let mut sums = vec![angle_about(along, tilted, seen)];
@@ -177,7 +178,7 @@ fn solve_three_parallel(axes: &[Axis; 6], motion: &Pose, found: &mut Solutions) 
                 let before = compose(&about(along, sum), &about(fifth, e));
                 let f = remaining(sixth, &compose(&before.inverse(), &rest));
                 let hand = compose(&exponential(&axes[4], e), &exponential(&axes[5], f));
-                let elbow = compose(&rest, &hand.inverse()).transform(axes[3].point);
+                let elbow = transform(&compose(&rest, &hand.inverse()), axes[3].point);
                 for [b, c] in found.two_parallel(&axes[1], &axes[2], axes[3].point, elbow) {
                     found.all.push([-back, b, c, fourth_sign * (sum - b - third_sign * c), e, f]);
                 }
@@ -204,17 +205,17 @@ impl Solutions {
 
     /// Angles about an axis that bring a point to a distance from another point.
     fn distances(&mut self, axis: &Axis, point: Vector, from: Vector, distance: f64) -> Vec<f64> {
-        let (arm, offset) = (difference(point, axis.point), difference(axis.point, from));
-        let product = (distance * distance - dot(arm, arm) - dot(offset, offset)) / 2.0;
+        let (arm, offset) = (point - axis.point, axis.point - from);
+        let product = (distance * distance - arm.dot(arm) - offset.dot(offset)) / 2.0;
         self.angles(wave(axis.direction, arm, offset), product)
     }
 
     /// Angles of two parallel axes that bring a point to a target at the same position along them.
     fn two_parallel(&mut self, first: &Axis, second: &Axis, point: Vector, target: Vector) -> Vec<[f64; 2]> {
-        let seen = difference(target, first.point);
-        let bends = self.distances(second, point, first.point, norm(seen));
+        let seen = target - first.point;
+        let bends = self.distances(second, point, first.point, seen.length());
         let both = |bend: f64| {
-            let bent = difference(turned(second, bend, point), first.point);
+            let bent = turned(second, bend, point) - first.point;
             [angle_about(first.direction, bent, seen), bend]
         };
         bends.into_iter().map(both).collect()
@@ -224,15 +225,15 @@ impl Solutions {
     fn three_turns(&mut self, [a, b, c]: [Vector; 3], rotation: &Pose) -> Vec<[f64; 3]> {
         let seen = rotate(rotation, c);
         let mut ways = Vec::new();
-        for middle in self.angles(wave(b, c, a), dot(a, seen)) {
+        for middle in self.angles(wave(b, c, a), a.dot(seen)) {
             let third = rotate(&about(b, middle), c);
             let last = |outer: f64| {
                 let before = compose(&about(a, outer), &about(b, middle));
                 remaining(c, &compose(&before.inverse(), rotation))
             };
-            if norm(cross(a, third)) < EXACT {
+            if a.cross(third).length() < EXACT {
                 // Only the sum of the two outer turns matters.
-                let (sum, sign) = (last(0.0), dot(a, third).signum());
+                let (sum, sign) = (last(0.0), a.dot(third).signum());
                 self.is_singular = true;
                 ways.extend(evenly().into_iter().map(|share| [sign * (sum - share), middle, share]));
             } else {
@@ -246,14 +247,14 @@ impl Solutions {
 
 /// The component along a vector of another vector rotated about a unit vector: coefficients of sine and cosine of the angle, and a constant.
 fn wave(axis: Vector, turned: Vector, along: Vector) -> [f64; 3] {
-    let constant = dot(axis, turned) * dot(axis, along);
-    [dot(along, cross(axis, turned)), dot(along, turned) - constant, constant]
+    let constant = axis.dot(turned) * axis.dot(along);
+    [along.dot(axis.cross(turned)), along.dot(turned) - constant, constant]
 }
 
 /// The angle of a rotation about this axis.
 fn remaining(axis: Vector, rotation: &Pose) -> f64 {
     let [x, y, z, w] = rotation.quaternion_xyzw;
-    2.0 * dot(axis, [x, y, z]).atan2(w)
+    2.0 * axis.dot(Vector::new(x, y, z)).atan2(w)
 }
 
 fn evenly() -> Vec<f64> {
@@ -263,25 +264,23 @@ fn evenly() -> Vec<f64> {
 /// The rigid motion of a rotation about an axis.
 fn exponential(axis: &Axis, angle: f64) -> Pose {
     let turn = about(axis.direction, angle);
-    Pose { position: difference(axis.point, rotate(&turn, axis.point)), ..turn }
+    Pose { position: (axis.point - rotate(&turn, axis.point)).into(), ..turn }
 }
 
 fn turned(axis: &Axis, angle: f64, point: Vector) -> Vector {
-    exponential(axis, angle).transform(point)
+    transform(&exponential(axis, angle), point)
 }
 
 /// The midpoint between the closest points of two axes, and their distance; `None` for parallel axes.
 fn between(a: &Axis, b: &Axis) -> Option<(Vector, f64)> {
-    let normal = cross(a.direction, b.direction);
-    let square = dot(normal, normal);
+    let normal = a.direction.cross(b.direction);
+    let square = normal.dot(normal);
     if square < EXACT {
         return None;
     }
-    let way = difference(b.point, a.point);
-    let on_a = dot(cross(way, b.direction), normal) / square;
-    let on_b = dot(cross(way, a.direction), normal) / square;
-    let place =
-        |axis: &Axis, along: f64| -> Vector { std::array::from_fn(|i| axis.point[i] + along * axis.direction[i]) };
-    let (p, q) = (place(a, on_a), place(b, on_b));
-    Some((std::array::from_fn(|i| f64::midpoint(p[i], q[i])), norm(difference(p, q))))
+    let way = b.point - a.point;
+    let on_a = way.cross(b.direction).dot(normal) / square;
+    let on_b = way.cross(a.direction).dot(normal) / square;
+    let (p, q) = (a.point + on_a * a.direction, b.point + on_b * b.direction);
+    Some((p.midpoint(q), (p - q).length()))
 }

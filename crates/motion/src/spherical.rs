@@ -3,9 +3,10 @@
 //! about the line from shoulder to wrist. All axes are those at zero positions, with products of exponentials from there (Paden-Kahan
 //! subproblems; Murray, Li, Sastry: *A Mathematical Introduction to Robotic Manipulation*, 3.3).
 
-use crate::frame::{compose, cross, difference, norm, rotate};
+use crate::frame::compose;
 use crate::joint_vector::JointVector;
 use crate::robot_model::{Drive, Joint};
+use crate::vector::{Vector, position, rotate, transform, unit};
 use ratn_model::pose::Pose;
 use std::f64::consts::{PI, TAU};
 
@@ -14,8 +15,6 @@ const MEETING: f64 = 1e-9;
 
 /// Axes within this angle count as parallel, in radians: a tenth of a pose's tolerance.
 const IN_LINE: f64 = 1e-7;
-
-pub(crate) type Vector = [f64; 3];
 
 /// The geometry of such an arm at zero positions.
 #[derive(Debug, Clone)]
@@ -35,18 +34,18 @@ impl Spherical {
     pub(crate) fn of(chain: &[(Pose, Drive)], tip: &Pose) -> Option<Spherical> {
         let chain: &[(Pose, Drive); 7] = chain.try_into().ok()?;
         let mut pose = Pose::IDENTITY;
-        let (mut axes, mut points, mut joints) = ([[0.0; 3]; 7], [[0.0; 3]; 7], [0; 7]);
+        let (mut axes, mut points, mut joints) = ([Vector::ZERO; 7], [Vector::ZERO; 7], [0; 7]);
         for (i, (origin, drive)) in chain.iter().enumerate() {
             pose = compose(&pose, origin);
-            (axes[i], points[i], joints[i]) = (rotate(&pose, drive.axis), pose.position, drive.joint);
+            (axes[i], points[i], joints[i]) = (rotate(&pose, drive.axis), position(&pose), drive.joint);
         }
         let turns = chain.iter().all(|(_, drive)| !drive.slides && drive.factor == 1.0);
         let distinct = (0..7).all(|i| !joints[..i].contains(&joints[i]));
-        let square = [(0, 1), (1, 2), (4, 5), (5, 6)].iter().all(|(a, b)| dot(axes[*a], axes[*b]).abs() < MEETING);
+        let square = [(0, 1), (1, 2), (4, 5), (5, 6)].iter().all(|(a, b)| axes[*a].dot(axes[*b]).abs() < MEETING);
         let meeting = |first: usize| {
             let point = meeting(points[first], axes[first], points[first + 1], axes[first + 1])?;
-            let beside = difference(point, points[first + 2]);
-            (norm(cross(beside, axes[first + 2])) < MEETING).then_some(point)
+            let beside = point - points[first + 2];
+            (beside.cross(axes[first + 2]).length() < MEETING).then_some(point)
         };
         if !turns || !distinct || !square {
             return None;
@@ -59,18 +58,18 @@ impl Spherical {
     pub(crate) fn turn(&self, positions: &JointVector) -> f64 {
         let q: [f64; 7] = std::array::from_fn(|i| positions[self.joints[i]]);
         let shoulder = self.three(0, [q[0], q[1], q[2]]);
-        let reach = difference(self.bent(q[3]), self.shoulder);
+        let reach = self.bent(q[3]) - self.shoulder;
         let line = rotate(&shoulder, reach);
         let zero = from_to(reach, line);
         let rest = compose(&shoulder, &zero.inverse()).quaternion_xyzw;
-        let along = (0..3).map(|i| rest[i] * line[i]).sum::<f64>() / norm(line).max(f64::MIN_POSITIVE);
+        let along = Vector::new(rest[0], rest[1], rest[2]).dot(unit(line));
         wrapped(2.0 * along.atan2(rest[3]))
     }
 
     /// The elbow angles that put the wrist where a pose needs it; empty where that is too far away or too close.
     pub(crate) fn bends_for(&self, target: &Pose) -> Vec<f64> {
         let motion = self.motion(target);
-        self.bends(norm(difference(motion.transform(self.wrist), self.shoulder)))
+        self.bends((transform(&motion, self.wrist) - self.shoulder).length())
     }
 
     /// All postures that bring the frame to a pose with the elbow at one of its bends and at this turn: each joint in the turn within its
@@ -113,8 +112,8 @@ impl Spherical {
     }
 
     fn turned_shoulder(&self, motion: &Pose, bend: f64, turn: f64) -> Pose {
-        let line = difference(motion.transform(self.wrist), self.shoulder);
-        let reach = difference(self.bent(bend), self.shoulder);
+        let line = transform(motion, self.wrist) - self.shoulder;
+        let reach = self.bent(bend) - self.shoulder;
         compose(&about(unit(line), turn), &from_to(reach, line))
     }
 
@@ -125,23 +124,21 @@ impl Spherical {
 
     /// The wrist's position after bending the elbow.
     fn bent(&self, bend: f64) -> Vector {
-        let [x, y, z] = rotate(&about(self.axes[3], bend), difference(self.wrist, self.elbow));
-        [x + self.elbow[0], y + self.elbow[1], z + self.elbow[2]]
+        rotate(&about(self.axes[3], bend), self.wrist - self.elbow) + self.elbow
     }
 
     /// Elbow angles that bring the wrist this far from the shoulder.
     fn bends(&self, distance: f64) -> Vec<f64> {
         let axis = self.axes[3];
-        let (p, q) = (difference(self.wrist, self.elbow), difference(self.shoulder, self.elbow));
-        let (along_p, along_q) = (dot(axis, p), dot(axis, q));
-        let across = |v: Vector, along: f64| -> Vector { std::array::from_fn(|i| v[i] - along * axis[i]) };
-        let (p, q) = (across(p, along_p), across(q, along_q));
+        let (p, q) = (self.wrist - self.elbow, self.shoulder - self.elbow);
+        let (along_p, along_q) = (axis.dot(p), axis.dot(q));
+        let (p, q) = (p - along_p * axis, q - along_q * axis);
         let square = distance * distance - (along_p - along_q).powi(2);
-        let cosine = (dot(p, p) + dot(q, q) - square) / (2.0 * norm(p) * norm(q));
+        let cosine = (p.dot(p) + q.dot(q) - square) / (2.0 * p.length() * q.length());
         if cosine.is_nan() || cosine.abs() > 1.0 + 1e-12 {
             return Vec::new();
         }
-        let straight = dot(axis, cross(p, q)).atan2(dot(p, q));
+        let straight = axis.dot(p.cross(q)).atan2(p.dot(q));
         let half = cosine.clamp(-1.0, 1.0).acos();
         if half < 1e-9 { vec![straight] } else { vec![straight + half, straight - half] }
     }
@@ -157,9 +154,9 @@ impl Spherical {
         let [a, b, c] = [self.axes[first], self.axes[first + 1], self.axes[first + 2]];
         // Rotating c about b keeps its component along b; only the middle angle changes its component along a.
         let seen = rotate(rotation, c);
-        let (cosine, sine) = (dot(a, c), dot(a, cross(b, c)));
+        let (cosine, sine) = (a.dot(c), a.dot(b.cross(c)));
         let (size, zero) = (cosine.hypot(sine), sine.atan2(cosine));
-        let half = (dot(a, seen) / size).clamp(-1.0, 1.0).acos();
+        let half = (a.dot(seen) / size).clamp(-1.0, 1.0).acos();
         [half, -half].map(|half| {
             let middle = zero + half;
             let third = rotate(&about(b, middle), c);
@@ -167,9 +164,9 @@ impl Spherical {
                 let done = compose(&about(a, outer), &about(b, middle));
                 angle_about(c, b, rotate(&compose(&done.inverse(), rotation), b))
             };
-            if norm(cross(a, third)) < IN_LINE {
+            if a.cross(third).length() < IN_LINE {
                 // Only the sum of the two outer turns matters: half of it for each satisfies the most limits.
-                let outer = last(0.0) / 2.0 * dot(a, third).signum();
+                let outer = last(0.0) / 2.0 * a.dot(third).signum();
                 return [outer, middle, last(outer)];
             }
             let outer = angle_about(a, third, seen);
@@ -180,47 +177,38 @@ impl Spherical {
 
 /// The intersection of two lines, if there is one.
 fn meeting(p: Vector, a: Vector, q: Vector, b: Vector) -> Option<Vector> {
-    let normal = cross(a, b);
-    let way = difference(q, p);
-    let square = dot(normal, normal);
-    if square < MEETING || dot(way, normal).abs() > MEETING {
+    let normal = a.cross(b);
+    let way = q - p;
+    let square = normal.dot(normal);
+    if square < MEETING || way.dot(normal).abs() > MEETING {
         return None;
     }
-    let along = dot(cross(way, b), normal) / square;
-    Some(std::array::from_fn(|i| p[i] + along * a[i]))
-}
-
-pub(crate) fn dot(a: Vector, b: Vector) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-fn unit(v: Vector) -> Vector {
-    let length = norm(v).max(f64::MIN_POSITIVE);
-    v.map(|c| c / length)
+    let along = way.cross(b).dot(normal) / square;
+    Some(p + along * a)
 }
 
 /// A rotation about a unit vector.
-pub(crate) fn about([x, y, z]: Vector, angle: f64) -> Pose {
+pub(crate) fn about(axis: Vector, angle: f64) -> Pose {
     let (sin, cos) = (angle / 2.0).sin_cos();
-    Pose { position: [0.0; 3], quaternion_xyzw: [x * sin, y * sin, z * sin, cos] }
+    Pose { position: [0.0; 3], quaternion_xyzw: (axis * sin).extend(cos).into() }
 }
 
 /// The angle about an axis from one vector to another.
 pub(crate) fn angle_about(axis: Vector, from: Vector, to: Vector) -> f64 {
-    let across = |v: Vector| -> Vector { std::array::from_fn(|i| v[i] - dot(axis, v) * axis[i]) };
+    let across = |v: Vector| v - axis.dot(v) * axis;
     let (from, to) = (across(from), across(to));
-    dot(axis, cross(from, to)).atan2(dot(from, to))
+    axis.dot(from.cross(to)).atan2(from.dot(to))
 }
 
 /// The shortest rotation from one direction to another.
 fn from_to(from: Vector, to: Vector) -> Pose {
     let (from, to) = (unit(from), unit(to));
-    let axis = cross(from, to);
-    if norm(axis) < 1e-12 {
-        let aside = if from[0].abs() < 0.9 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] };
-        return about(unit(cross(from, aside)), if dot(from, to) > 0.0 { 0.0 } else { PI });
+    let axis = from.cross(to);
+    if axis.length() < 1e-12 {
+        let aside = if from.x.abs() < 0.9 { Vector::X } else { Vector::Y };
+        return about(unit(from.cross(aside)), if from.dot(to) > 0.0 { 0.0 } else { PI });
     }
-    about(unit(axis), norm(axis).atan2(dot(from, to)))
+    about(unit(axis), axis.length().atan2(from.dot(to)))
 }
 
 /// The turn of an angle that is within a joint's limits and nearest to a position; without one, the turn nearest to the limits.
