@@ -9,10 +9,10 @@ use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// The most boxes that a cell can have: as many as there are places on the base.
+/// The maximum number of boxes in a cell: the number of places on the base.
 pub const MAX_BOXES: usize = 9;
 
-/// The most of each kind of tableware that a cell can have: as many as there are places for it on the table.
+/// The maximum number of each kind of tableware in a cell: the number of places for it on the table.
 pub const MAX_TABLEWARE: usize = 3;
 
 /// The longest time that the resource manager waits for standstill.
@@ -21,14 +21,14 @@ const LONGEST_STANDSTILL: Duration = Duration::from_secs(60);
 /// The robot of the paper.
 pub const AIMM: &str = "aimm";
 
-/// The scene that the cell begins with: those of the paper's two experiments.
+/// The scene that the cell begins with: one for each of the paper's two experiments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Setting {
     /// Boxes on a table, to be fetched onto the base.
     #[default]
     Boxes,
-    /// Bowls, forks and cups on a rack, to be set on a table that plates lie on already.
+    /// Bowls, forks and cups on a rack, to be set on a table that already has plates.
     Table,
 }
 
@@ -56,7 +56,7 @@ pub struct CellConfig {
     pub listen: Endpoint,
     /// The endpoint of the resource manager; unless given, the one in the runtime directory.
     pub resource_manager: Option<Endpoint>,
-    /// The name of the host that the resources are offered with.
+    /// The host name under which the resources are offered.
     pub host: String,
     /// The robot: the name of a built-in one, or the path of a `robot.toml`.
     pub robot: String,
@@ -76,17 +76,17 @@ pub struct CellConfig {
     pub seed: u64,
     /// The robot's seconds per second of wall time.
     pub speed: f64,
-    /// How long the session with the resource manager outlives the last keep-alive, in milliseconds.
+    /// How long the session with the resource manager survives without a keep-alive, in milliseconds.
     pub session_ttl_ms: u64,
-    /// When a lease of a module that moves has ended, the next lease is granted once the cell has confirmed standstill, and after this many
-    /// milliseconds at the latest. At least `session_ttl_ms`, because the cell may not hear of the end for so long; unless given, 3 s more.
+    /// When a lease of a module that can move has ended, the next lease is granted once the cell has confirmed standstill, at the latest after this many
+    /// milliseconds. At least `session_ttl_ms`, because the cell may learn of the end that late; unless given, 3 s more.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub standstill_ms: Option<u64>,
-    /// The folder in which an emergency stop is kept, so that it outlasts the process: choose one that a reboot does not empty. `state/cell`
-    /// in the runtime directory unless given.
+    /// The folder in which an emergency stop is stored so that it survives the process: choose one that a reboot does not empty. By default
+    /// `state/cell` in the runtime directory.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub state_dir: Option<PathBuf>,
-    /// The new file that the cell records everything in, for `ratn cell --replay`.
+    /// The new file to which the cell records everything, for `ratn cell --replay`.
     pub record: Option<PathBuf>,
     /// The faults to inject: `grasp_slips:2` at the second grasp, `object_moved@12.5` at a time, `sensor_dropout~0.05` by chance.
     pub faults: Vec<Fault>,
@@ -100,21 +100,21 @@ pub struct CellConfig {
     pub camera: CameraConfig,
     /// The battery.
     pub battery: BatteryConfig,
-    /// How wrong the robot's model of itself is.
+    /// The errors of the robot's model of itself.
     pub errors: ErrorsConfig,
 }
 
-/// The controllers that move arm and base along their trajectories: critically damped second-order systems. The stiffer, the less they lag.
+/// The controllers that move arm and base along their trajectories: critically damped second-order systems. The stiffer they are, the less they lag.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ControllersConfig {
     /// Stiffness of the arm's joints: the natural frequency in radians per second.
     pub arm_stiffness: f64,
-    /// The greatest error of a joint, in radians; beyond it the motion ends `aborted`.
+    /// The maximum error of a joint, in radians; beyond it the motion ends `aborted`.
     pub arm_most_off_rad: f64,
     /// Stiffness of the base: the natural frequency in radians per second.
     pub base_stiffness: f64,
-    /// The greatest error of the base, in metres and in radians; beyond it the drive ends `aborted`.
+    /// The maximum error of the base, in metres and in radians; beyond it the drive ends `aborted`.
     pub base_most_off: f64,
 }
 
@@ -122,12 +122,12 @@ pub struct ControllersConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GripperConfig {
-    /// The opening between the fingers, in metres; unless given, as far as the robot's fingers can open, which is also the most.
+    /// The opening between the fingers, in metres; by default, and at most, as far as the robot's fingers can open.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub opening_m: Option<f64>,
-    /// How long it takes to close, in the robot's seconds.
+    /// Time that closing takes, in the robot's seconds.
     pub close_s: f64,
-    /// How long it takes to open, in the robot's seconds.
+    /// Time that opening takes, in the robot's seconds.
     pub open_s: f64,
     /// The force of each finger, in newtons.
     pub force_n: f64,
@@ -137,9 +137,9 @@ pub struct GripperConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PanTiltConfig {
-    /// The fraction of its greatest speed that it uses, above 0 and at most 1.
+    /// The fraction of its maximum speed that it uses, above 0 and at most 1.
     pub speed: f64,
-    /// How long it takes to come to rest, in the robot's seconds.
+    /// Time that it takes to come to rest, in the robot's seconds.
     pub settle_s: f64,
 }
 
@@ -151,7 +151,7 @@ pub struct CameraConfig {
     pub frames_per_s: f64,
     /// The intrinsic parameters: focal lengths and principal point in pixels, and the size of the image.
     pub intrinsics: Intrinsics,
-    /// Its noise.
+    /// The camera's noise.
     pub noise: Noise,
 }
 
@@ -162,15 +162,15 @@ pub struct CameraConfig {
 pub struct ErrorsConfig {
     /// Zero offset of each of the arm's encoders, in radians.
     pub encoder_rad: f64,
-    /// Amplitude of the periodic error, once a turn, of each encoder, in radians.
+    /// Amplitude of each encoder's periodic error, with one period per turn, in radians.
     pub encoder_wave_rad: f64,
-    /// Position of the camera on the head along each axis, in metres.
+    /// Error of the camera's position on the head along each axis, in metres.
     pub camera_m: f64,
-    /// Orientation of the camera about each axis, in radians.
+    /// Error of the camera's orientation about each axis, in radians.
     pub camera_rad: f64,
-    /// Localised position of the base along each axis, in metres; drawn anew at every stop.
+    /// Error of the base's localised position along each axis, in metres; drawn anew at every stop.
     pub localisation_m: f64,
-    /// Localised heading of the base, in radians; drawn anew at every stop.
+    /// Error of the base's localised heading, in radians; drawn anew at every stop.
     pub localisation_rad: f64,
 }
 
@@ -180,19 +180,19 @@ pub struct ErrorsConfig {
 pub struct BatteryConfig {
     /// The charge at the start, 0 to 1.
     pub level: f64,
-    /// The charge that one hour of standing uses, as a fraction.
+    /// The charge that one hour without motion uses, as a fraction.
     pub idle_per_hour: f64,
-    /// The charge that one hour of moving the arm uses beside that.
+    /// The additional charge that one hour of arm motion uses.
     pub motion_per_hour: f64,
-    /// The charge that one hour of driving uses beside that.
+    /// The additional charge that one hour of driving uses.
     pub driving_per_hour: f64,
 }
 
 impl Setting {
-    /// All of them.
+    /// All settings.
     pub const ALL: [Setting; 2] = [Setting::Boxes, Setting::Table];
 
-    /// As in a text.
+    /// The name of the setting in texts.
     pub fn name(self) -> &'static str {
         match self {
             Setting::Boxes => "boxes",
@@ -200,7 +200,7 @@ impl Setting {
         }
     }
 
-    /// The setting of that name.
+    /// The setting with this name.
     pub fn named(name: &str) -> Option<Setting> {
         Setting::ALL.into_iter().find(|setting| setting.name() == name)
     }
@@ -216,7 +216,7 @@ impl ErrorsConfig {
         localisation_m: 0.0,
         localisation_rad: 0.0,
     };
-    /// The errors of a robot that is calibrated with care.
+    /// The errors of a carefully calibrated robot.
     pub const REALISTIC: ErrorsConfig = ErrorsConfig {
         encoder_rad: 2e-4,
         encoder_wave_rad: 2e-4,
@@ -225,7 +225,7 @@ impl ErrorsConfig {
         localisation_m: 0.005,
         localisation_rad: 0.00524,
     };
-    /// The errors of a robot that was calibrated once and has been used for long.
+    /// The errors of a robot that was calibrated once and has been used for a long time.
     pub const ROUGH: ErrorsConfig = ErrorsConfig {
         encoder_rad: 5e-4,
         encoder_wave_rad: 5e-4,
@@ -235,8 +235,7 @@ impl ErrorsConfig {
         localisation_rad: 0.00873,
     };
 
-    /// The covariance of the camera's pose as it is told: place and a small turn, along and about the axes of its optical frame, in metres² and
-    /// radians².
+    /// The covariance of the camera's nominal pose: position and small rotation along and about the axes of its optical frame, in metres² and radians².
     pub fn camera_covariance(&self) -> [f64; 6] {
         std::array::from_fn(|i| if i < 3 { self.camera_m } else { self.camera_rad }.powi(2))
     }
@@ -254,7 +253,7 @@ impl Goods {
         }
     }
 
-    /// How many objects this setting has in all.
+    /// The total number of objects in this setting.
     pub fn count(&self, setting: Setting) -> usize {
         match setting {
             Setting::Boxes => self.boxes,
@@ -267,11 +266,11 @@ impl Goods {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("`{key}` of the cell is {value}: it must be {rule}")]
 pub struct ConfigError {
-    /// Which.
+    /// The key.
     pub key: &'static str,
-    /// What it is.
+    /// Its value.
     pub value: String,
-    /// What it must be.
+    /// The rule for its values.
     pub rule: &'static str,
 }
 
@@ -282,8 +281,8 @@ impl CellConfig {
         Goods { boxes, bowls, forks, cups, plates }
     }
 
-    /// The time after which the next lease of a module that moves is granted at the latest. Braking takes seconds of the robot, which last
-    /// longer in a cell that is slowed down; below a speed of 0.06 they last longer than this time may be.
+    /// The maximum time until the next lease of a module that can move is granted. Braking takes a time in the robot's seconds, which is longer in a
+    /// slowed-down cell; below a speed of 0.06 it exceeds the longest time that is allowed here.
     pub fn standstill(&self) -> Duration {
         let ttl = Duration::from_millis(self.session_ttl_ms);
         let braking = (standstill_bound(ttl) - ttl).div_f64(self.speed.clamp(1e-3, 1.0));
@@ -291,10 +290,10 @@ impl CellConfig {
         self.standstill_ms.map_or(unless_given, Duration::from_millis)
     }
 
-    /// Checks what the types cannot say.
+    /// Checks the rules that the types cannot express.
     ///
     /// # Errors
-    /// [`ConfigError`] names the first value that no cell can have.
+    /// [`ConfigError`] names the first invalid value.
     pub fn check(&self) -> Result<(), ConfigError> {
         let rules = [
             ("boxes", self.boxes as f64, (1..=MAX_BOXES).contains(&self.boxes), "1 to 9"),

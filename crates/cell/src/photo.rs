@@ -1,4 +1,4 @@
-//! The cell as it begins, photographed from anywhere: for people who want to see what a configuration means.
+//! A photograph of the cell's initial scene from any viewpoint: for people who want to see what a configuration means.
 
 use crate::config::CellConfig;
 use crate::core::cell::Cell;
@@ -9,11 +9,10 @@ use ratn_perception::camera::{Camera, Intrinsics};
 /// 1280 × 960 pixels, 65° × 51°.
 const OPTICS: Intrinsics = Intrinsics { width: 1280, height: 960, fx: 1000.0, fy: 1000.0, cx: 639.5, cy: 479.5 };
 
-/// A PNG file of the cell, taken from a place (without one, by a camera where the robot has its own) towards another; metres, in
-/// the world.
+/// A PNG photograph of the cell from one point towards another, in metres, in the world; without `from`, by a camera at the pose of the robot's own.
 ///
 /// # Errors
-/// Where the config is none, no table can be laid, or both places are one.
+/// If the config is invalid, no table can be laid, or both points are the same.
 pub fn photo(config: CellConfig, from: Option<[f64; 3]>, towards: [f64; 3]) -> anyhow::Result<Vec<u8>> {
     config.check()?;
     let cell = Cell::new(config)?;

@@ -1,4 +1,4 @@
-//! Our cell in numbers: where the table, the places on the base and the boxes are, and the postures that tasks name.
+//! The dimensions of our cell: positions of the table, the places on the base and the boxes, and the named postures of tasks.
 //!
 //! World frame: metres, floor at z = 0, the robot's base at the origin looking along x. The base's body is 1.10 × 0.60 × 0.60,
 //! centred at x = -0.20; the arm stands on it at x = 0.20, turned by 90° so that its first joint's dead sector points to the
@@ -22,19 +22,19 @@ pub const TABLE_CENTRE: [f64; 3] = [0.80, 0.0, 0.675];
 /// The table's top slab: its edges.
 pub const TABLE_SIZE: [f64; 3] = [0.60, 1.20, 0.05];
 
-/// Where the centres of boxes may stand on the table: least and greatest x, least and greatest y. Any yaw.
+/// Where the centres of boxes may stand on the table: minimum and maximum x, minimum and maximum y. Any yaw.
 pub const BOX_REGION: [[f64; 2]; 2] = [[0.62, 0.84], [-0.38, 0.38]];
 
-/// Least edges of a box (longer horizontal, shorter horizontal, height) that the gripper can take.
+/// Minimum edges of a box (longer horizontal, shorter horizontal, height) that the gripper can take.
 pub const BOX_LEAST: [f64; 3] = [0.06, 0.06, 0.08];
 
-/// Greatest edges of a box.
+/// Maximum edges of a box.
 pub const BOX_GREATEST: [f64; 3] = [0.16, 0.09, 0.12];
 
-/// The widest that the fingers open, in metres.
+/// The maximum opening of the fingers, in metres.
 pub const GRIPPER_OPENING_M: f64 = 0.11;
 
-/// How many places for boxes the deck has.
+/// Number of places for boxes on the deck.
 pub const SLOT_COUNT: usize = 9;
 
 /// Arm at rest in front of the base, tool downwards above the table.
@@ -46,8 +46,8 @@ pub const OBSERVATION: JointVector = JointVector::of([0.9, -1.2, 0.0, 0.9, 0.0, 
 /// Arm folded within the base's outline, for driving; the camera sees the whole deck.
 pub const STOWED: JointVector = JointVector::of([FRAC_PI_2, 0.3, 0.0, 2.05, 0.0, -0.8, 0.0]);
 
-/// The places `slot_1`..`slot_9` on the deck, seen from the base: on the deck's surface, x along a box's longer edge, which
-/// lies across the base. Three rows behind the arm, nearest first, each from right to left.
+/// The places `slot_1`..`slot_9` on the deck, in the base's frame: on the deck's surface, x along a box's longer edge, which is across the base.
+/// Three rows behind the arm, nearest first, each from right to left.
 pub fn slots() -> [Pose; SLOT_COUNT] {
     std::array::from_fn(|i| {
         let (row, column) = ((i / 3) as f64, (i % 3) as f64);
@@ -83,7 +83,7 @@ mod tests {
         SceneObject { name: name.into(), shape: Shape::Box { size }, placement }
     }
 
-    /// Some solution at the grasp from which the straight line up is free.
+    /// Checks that some solution at a grasp has a free straight line up.
     fn reachable(robot: &Robot, scene: &Scene, pose: &Pose, size: [f64; 3]) -> Result<(), String> {
         let reach = arm::reach(robot);
         let mut checker = Checker::new(robot, scene, &arm::assumed(robot, scene), PADDING_M);
@@ -159,13 +159,13 @@ mod tests {
         }
     }
 
-    /// Which points of a patch of floor, or up to a box's height above it, the robot hides from the camera looking at `target`.
+    /// The points of a patch of floor, and at a box's height above it, that the robot hides from the camera looking at `target`.
     fn hidden(arm: JointVector, target: [f64; 3], [x_low, x_high]: [f64; 2], [y_low, y_high]: [f64; 2]) -> Vec<String> {
         let robot = Robot::aimm();
         let (pan, tilt) = robot.look_at(&robot.at_zero(), target);
         let configuration = Configuration { arm, pan, tilt, finger: GRIPPER_OPENING_M / 2.0, ..robot.at_zero() };
         let eye = robot.camera_pose(&configuration).unwrap().position;
-        // The base carries the deck: looking at it, its surface is no obstacle.
+        // The base carries the deck: when the camera looks at the deck, the base is no obstacle.
         let body = robot.link("base").unwrap();
         let shapes: Vec<_> = robot.shapes(&configuration).into_iter().filter(|(link, ..)| *link != body).collect();
         let mut hidden = Vec::new();

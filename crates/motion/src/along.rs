@@ -1,17 +1,17 @@
-//! Whether something holds all along a timed curve: a proof, not samples.
+//! Checks that a property holds on a whole timed curve: a proof, not samples.
 //!
-//! At the middle of a piece of the curve it is said how far the tool may move and turn from there. If no joint strays so far within the piece
-//! that the tool could (`levers`), the piece holds; else its halves are looked at.
+//! At the middle of a piece of the curve, `room` tells how far the tool may move and rotate from there. If no joint deviates so far within the piece
+//! that the tool could exceed this (`levers`), the property holds on the piece; else its halves are checked.
 
 use crate::joint_vector::JointVector;
 use crate::levers::Levers;
 use crate::trajectory::Curve;
 
-/// What is broken by less may go unseen, in metres and radians.
+/// Smaller violations may be missed, in metres and radians.
 const RESOLUTION: f64 = 1e-5;
 
-/// The first moment, in seconds, at which something does not hold. `room` says of a posture how far the tool may move (metres) and turn
-/// (radians) from there; less than nothing where it does not hold.
+/// The first time, in seconds, at which the property does not hold. `room` returns how far the tool may move (metres) and rotate (radians) from a
+/// posture; negative where the property does not hold.
 pub(crate) fn first_breach(
     curve: &Curve,
     levers: &Levers,
@@ -23,7 +23,7 @@ pub(crate) fn first_breach(
     }
     for (i, pair) in knots.windows(2).enumerate() {
         let cubics = curve.cubics(i);
-        // In order of time: the last is taken first.
+        // In order of time: the last element is taken first.
         let mut pieces = vec![[0.0, pair[1].time_s - pair[0].time_s]];
         while let Some([from, to]) = pieces.pop() {
             let middle = (from + to) / 2.0;

@@ -1,22 +1,22 @@
-//! Robots with several arms: first one arm moves and the others stand still, then the next (prioritized planning: Erdmann and Lozano-Pérez, 1987).
-//! Each search has the joints of one branch alone, so its samples fill seven dimensions instead of fourteen. In the end the motions
-//! are made at the same time where that is free. Where no order of the branches leads to the goal, the caller searches with all joints.
+//! Plans for robots with several arms: first one arm moves while the others stand, then the next (prioritized planning: Erdmann and Lozano-Pérez,
+//! 1987). Each search has only the joints of one branch, so its samples fill seven dimensions instead of fourteen. At the end the motions are made
+//! simultaneous where that is free. If no order of the branches leads to the goal, the caller searches with all joints.
 
 use crate::mechanism::MAX_JOINTS;
 use crate::space::{Space, State, between, distance};
 
-/// By how much of its own duration a branch begins after the one before it, in the order of trying.
+/// Delay of a branch's motion after the start of the one before, as a share of its duration, in the order of trying.
 const DELAYS: [f32; 4] = [0.0, 0.25, 0.5, 0.75];
 
-/// The joints of each branch: two joints are of one branch if one of them moves the other. Joints that move several branches are of
-/// the first one. `parents` has the joint next towards the root, for each joint.
+/// The joints of each branch: two joints belong to the same branch if one of them moves the other. Joints that move several branches belong to the
+/// first one. `parents` has, for each joint, the next joint towards the root.
 pub(crate) fn branches(parents: &[Option<usize>]) -> Vec<Vec<usize>> {
     let joints = parents.len();
     let mut children = vec![0; joints];
     for parent in parents.iter().flatten() {
         children[*parent] += 1;
     }
-    // A trunk has a fork at its end or towards its leaves.
+    // A trunk joint has a fork at its end or further towards the leaves.
     let mut is_trunk: Vec<bool> = children.iter().map(|c| *c > 1).collect();
     for mut joint in 0..joints {
         let forked = is_trunk[joint];
@@ -49,7 +49,7 @@ pub(crate) fn branches(parents: &[Option<usize>]) -> Vec<Vec<usize>> {
     found
 }
 
-/// A state with some joints of another.
+/// A state with some joints taken from another.
 pub(crate) fn with(state: &State, other: &State, joints: &[usize]) -> State {
     let mut mixed = *state;
     for &joint in joints {
@@ -58,7 +58,7 @@ pub(crate) fn with(state: &State, other: &State, joints: &[usize]) -> State {
     mixed
 }
 
-/// The motions of the branches, one after the other, made at the same time where that is free; each path moves other joints.
+/// The motions of the branches, one after the other, or simultaneous where that is free; each path moves other joints.
 pub(crate) fn together(space: &mut Space, paths: &[Vec<State>]) -> Vec<State> {
     let mut whole = paths[0].clone();
     for path in &paths[1..] {
@@ -72,7 +72,7 @@ pub(crate) fn together(space: &mut Space, paths: &[Vec<State>]) -> Vec<State> {
     whole
 }
 
-/// Two paths that follow each other and move different joints, the second beginning a part of its duration after the first.
+/// Merges two consecutive paths that move different joints; the second begins `delay` after the first, as a share of its duration.
 fn merged(first: &[State], second: &[State], delay: f32) -> Vec<State> {
     let (times, others) = (times(first, 0.0), times(second, delay));
     let mut all: Vec<f32> = times.iter().chain(&others).copied().collect();
@@ -81,7 +81,7 @@ fn merged(first: &[State], second: &[State], delay: f32) -> Vec<State> {
     let here = first[first.len() - 1];
     let joined = |time: &f32| {
         let (a, b) = (at(first, &times, *time), at(second, &others, *time));
-        // The second path stands where the first one ends, but for its own joints.
+        // The second path starts at the end of the first one, except for its own joints.
         std::array::from_fn::<f32, MAX_JOINTS, _>(|j| a[j] + b[j] - here[j])
     };
     let mut path: Vec<State> = all.iter().map(joined).collect();
@@ -90,7 +90,7 @@ fn merged(first: &[State], second: &[State], delay: f32) -> Vec<State> {
     path
 }
 
-/// When a path is at its postures, if it takes one unit of time after a delay.
+/// The times at which a path reaches its postures, if it takes one unit of time after a delay.
 fn times(path: &[State], delay: f32) -> Vec<f32> {
     let mut times = vec![0.0];
     for pair in path.windows(2) {
@@ -124,7 +124,7 @@ mod tests {
         assert_eq!(branches(&two), [[0, 1], [2, 3]]);
         let humanoid = [None, Some(0), Some(1), Some(0), Some(3)];
         assert_eq!(branches(&humanoid), [vec![1, 2, 0], vec![3, 4]]);
-        // A fork far out makes all before it a trunk.
+        // A fork far from the root makes all joints before it a trunk.
         let hand = [None, Some(0), Some(1), Some(1)];
         assert_eq!(branches(&hand), [vec![2, 0, 1], vec![3]]);
     }

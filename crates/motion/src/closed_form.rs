@@ -1,8 +1,8 @@
-//! Which six joints of a chain are solved in closed form, and where the others are held meanwhile.
+//! Which six joints of a chain are solved in closed form, with the others held at fixed positions.
 //!
-//! An arm of six joints whose axes allow it ([`six`](crate::six)) is solved whole: all postures of a pose are known, or that there are none. An
-//! arm with more joints is solved for each place of those that are left over: an arm on a column for a height of the column, one of
-//! seven joints whose wrist is not spherical for a turn of one joint.
+//! An arm of six joints whose axes allow it ([`six`](crate::six)) is solved completely: all postures of a pose are known, or that there are none. An
+//! arm with more joints is solved for fixed positions of the others: an arm on a column for a height of the column, an arm of seven joints without a
+//! spherical wrist for an angle of one joint.
 
 use crate::frame::compose;
 use crate::joint_vector::JointVector;
@@ -12,37 +12,37 @@ use crate::vector::{Vector, position, rotate};
 use ratn_model::pose::Pose;
 use std::f64::consts::TAU;
 
-/// A position that is so little beyond a limit may be at it: what rounded axes leave, in radians.
+/// Tolerance for positions beyond a limit, because axes are rounded, in radians.
 const SLACK: f64 = 1e-4;
 
-/// Chains with more joints are not looked at.
+/// Maximum number of joints of a chain that is tried.
 const MOST_JOINTS: usize = 10;
 
-/// Where the joints that are left over are put to see how the others fall apart, as shares of their ranges.
+/// Positions of the held joints at which the structure of the others is analysed, as shares of their ranges.
 const GENERIC: [f64; 2] = [0.37, 0.71];
 
-/// Six joints of a chain that fall apart wherever the others are.
+/// Six joints of a chain that have a closed-form solution for all positions of the others.
 #[derive(Debug, Clone)]
 pub(crate) struct ClosedForm {
-    /// The places in the chain of those six.
+    /// The indices of those six in the chain.
     solved: [usize; 6],
-    /// The joints that are left over.
+    /// The held joints.
     pub(crate) held: Vec<usize>,
     kind: Kind,
     is_exact: bool,
 }
 
-/// The postures of a pose with the held joints where they are.
+/// The postures of a pose with the held joints at given positions.
 #[derive(Debug, Clone)]
 pub(crate) struct Solved {
-    /// Within the limits, but for rounding; each joint in any of its turns.
+    /// Within the limits, up to rounding; each joint in any of its turns.
     pub(crate) postures: Vec<JointVector>,
-    /// Whether there are no others.
+    /// Whether these are all.
     pub(crate) is_complete: bool,
 }
 
 impl ClosedForm {
-    /// For a chain from the root on and the limits of its joints.
+    /// The closed form of a chain, from its root, with the limits of its joints.
     pub(crate) fn of(chain: &[(Pose, Drive)], joints: &[Joint]) -> Option<ClosedForm> {
         if !(6..=MOST_JOINTS).contains(&chain.len()) {
             return None;
@@ -74,7 +74,7 @@ impl ClosedForm {
         })
     }
 
-    /// The postures that bring the tip to a pose with the held joints, and those that are none of the chain's, as in `others`.
+    /// The postures that bring the tip to a pose, with the held joints and the joints outside of the chain as in `others`.
     pub(crate) fn solve(
         &self,
         chain: &[(Pose, Drive)],
@@ -99,7 +99,7 @@ impl ClosedForm {
     }
 }
 
-/// The axes of the solved joints where these are at zero, and the frame of the last joint.
+/// The axes of the solved joints when these are at zero, and the pose of the last joint's frame.
 fn axes(chain: &[(Pose, Drive)], solved: &[usize; 6], held: &JointVector) -> ([Axis; 6], Pose) {
     let mut axes = [Axis { direction: Vector::ZERO, point: Vector::ZERO }; 6];
     let (mut pose, mut next) = (Pose::IDENTITY, 0);
@@ -115,7 +115,7 @@ fn axes(chain: &[(Pose, Drive)], solved: &[usize; 6], held: &JointVector) -> ([A
     (axes, pose)
 }
 
-/// The turn of an angle that is nearest to a position, among those within the limits; of one that is beyond a limit by rounding, the limit.
+/// The turn of an angle that is nearest to a position, among those within the limits; if it exceeds a limit by rounding, the limit.
 pub(crate) fn turn_nearest(angle: f64, joint: &Joint, near: f64) -> Option<f64> {
     let least = ((joint.lower - SLACK - angle) / TAU).ceil();
     let most = ((joint.upper + SLACK - angle) / TAU).floor();

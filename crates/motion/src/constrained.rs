@@ -1,9 +1,9 @@
-//! Paths all of whose postures keep a frame where it may be, such as a bowl upright: two trees as in `connect`, grown by small
-//! steps, each projected onto the constraint (Berenson, Srinivasa, Ferguson, Kuffner: *Manipulation Planning on Constraint
-//! Manifolds*, ICRA 2009).
+//! Paths on which every posture satisfies a constraint on a frame, such as keeping a bowl upright: two trees as in `connect`, grown by small steps,
+//! each projected onto the constraint (Berenson, Srinivasa, Ferguson, Kuffner: *Manipulation Planning on Constraint Manifolds*, ICRA 2009).
 //!
-//! A step is taken only if it is free and if the constraint holds between its ends as well; so the path that comes out is a dense list of postures to be followed as they are. Steps are projected to half of
-//! the tolerance, which leaves the other half for what is between them: tolerances below [`LEAST_TOLERANCE`] ask for too much.
+//! A step is taken only if it is free and if the constraint holds between its ends as well; so the resulting path is a dense list of postures, to be
+//! followed without changes. Steps are projected to half of the tolerance, which leaves the other half for the motion between them: tolerances below
+//! [`LEAST_TOLERANCE`] cannot be planned.
 
 use crate::connect::{Budget, ConnectError, Route};
 use crate::joint_vector::JointVector;
@@ -17,38 +17,38 @@ use crate::tree::Tree;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// The least tolerance that makes sense, in radians or metres.
+/// The minimum tolerance, in radians or metres.
 pub const LEAST_TOLERANCE: f64 = 0.005;
 
-/// How far a step goes, in radians.
+/// Length of a step, in radians.
 const STEP: f32 = 0.0625;
 
-/// A step must come nearer by at least this share of itself, and its projection may lead at most so many steps away.
+/// Each step has to reduce the distance by at least this share of its length, and with its projection may be at most this many steps long.
 const LEAST_PROGRESS: f32 = 0.1;
 const MOST_ASTRAY: f32 = 2.0;
 
 /// Attempts at shortcuts that make most paths short.
 pub const SHORTCUTS: usize = 60;
 
-/// Kept back of every tolerance for what lies between the postures that are looked at, in radians and metres, and the greatest share of it.
+/// Reserve of every tolerance for the motion between the checked postures, in radians and metres, and its maximum share of the tolerance.
 const RESERVE: f64 = 5e-4;
 const RESERVED_SHARE: f64 = 0.1;
 
-/// Steps are projected this far into a large tolerance of position, in metres.
+/// Steps are projected this far inside of a large position tolerance, in metres.
 const INWARD_M: f64 = 0.01;
 
-/// What all postures of a path keep.
+/// A constraint for all postures of a path.
 #[derive(Debug, Clone)]
 pub struct Constraint {
     reach: Reach,
-    /// What is asked for, what is looked at, and what steps are projected to.
+    /// The requested tolerances, those that are checked, and those that steps are projected to.
     asked: Target,
     target: Target,
     inner: Target,
 }
 
 impl Constraint {
-    /// The frame of `reach` stays within the tolerances of `target`.
+    /// Keeps the frame of `reach` within the tolerances of `target`.
     pub fn new(reach: Reach, target: Target) -> Constraint {
         let less = |tolerance: [f64; 3]| tolerance.map(|t| t - RESERVE.min(RESERVED_SHARE * t));
         let half = |tolerance: [f64; 3]| tolerance.map(|t| if t < std::f64::consts::PI { t / 2.0 } else { t });
@@ -67,12 +67,12 @@ impl Constraint {
         JointVector::from_fn(self.reach.joints(), |j| f64::from(state[j]))
     }
 
-    /// Whether a posture keeps it.
+    /// Whether a posture satisfies the constraint.
     pub fn holds(&self, state: &State) -> bool {
         self.target.is_met_by(&self.reach.pose(&self.positions(state)))
     }
 
-    /// How far the frame may move, in metres, and turn, in radians, from a posture; less than nothing where it does not keep what is asked.
+    /// How far the frame may move, in metres, and rotate, in radians, from a posture; negative where it violates the requested tolerances.
     pub(crate) fn room(&self, positions: &JointVector) -> [f64; 2] {
         self.asked.room(&self.reach.pose(positions))
     }
@@ -81,7 +81,7 @@ impl Constraint {
         self.reach.levers()
     }
 
-    /// What a posture that does not keep it breaks.
+    /// How a posture violates the constraint.
     pub(crate) fn breach(&self, state: &State) -> String {
         let [left_m, left_rad] = self.room(&self.positions(state));
         match left_m < left_rad {
@@ -90,15 +90,15 @@ impl Constraint {
         }
     }
 
-    /// How far the frame's z axis is off that of the target, in radians.
+    /// The angle between the z axes of the frame and the target, in radians.
     pub fn tilt_rad(&self, state: &State) -> f64 {
         let up = [0.0, 0.0, 1.0];
         let (have, want) = (self.reach.pose(&self.positions(state)).rotate(up), self.target.pose.rotate(up));
         (0..3).map(|i| have[i] * want[i]).sum::<f64>().clamp(-1.0, 1.0).acos()
     }
 
-    /// Whether all postures of a straight motion keep it: those that are looked at are so close that what lies between them differs from the
-    /// line between their frames by less than half of what is kept back.
+    /// Whether all postures of a straight motion satisfy the constraint: the checked ones are so close that the motion between them deviates from the
+    /// line between their frames by less than half of the reserve.
     pub fn holds_along(&self, from: &State, to: &State) -> bool {
         let by = JointVector::from_fn(self.reach.joints(), |j| f64::from((from[j] - to[j]).abs()));
         let bends = [self.levers().bend_m(&by), self.levers().turns_rad(&by).powi(2) / 8.0];
@@ -107,7 +107,7 @@ impl Constraint {
         (1..=steps).all(|i| self.holds(&between(from, to, i as f32 / steps as f32)))
     }
 
-    /// The posture itself where it keeps it with room to spare, else one near it that does.
+    /// The posture itself if it is within the inner tolerances, else a posture near it that is.
     pub(crate) fn project(&self, state: &State) -> Option<State> {
         let positions = self.positions(state);
         if self.inner.is_met_by(&self.reach.pose(&positions)) {
@@ -117,13 +117,13 @@ impl Constraint {
     }
 }
 
-/// Tolerances of rotation, but for those that leave a turn free.
+/// Reduces rotation tolerances, except those that leave a rotation free.
 fn free_or(tolerance: [f64; 3], less: impl Fn([f64; 3]) -> [f64; 3]) -> [f64; 3] {
     let reduced = less(tolerance);
     std::array::from_fn(|i| if tolerance[i] < std::f64::consts::PI { reduced[i] } else { tolerance[i] })
 }
 
-/// Searches a path from `start` to one of `goals` that keeps the constraint. `control` gets the iterations so far.
+/// Searches for a path from `start` to one of `goals` that satisfies the constraint. `control` gets the number of iterations.
 ///
 /// # Errors
 /// [`ConnectError`] says why there is none.
@@ -176,7 +176,7 @@ fn grow(
     }
     let mut growing = 0;
     for iteration in 0..budget.iterations {
-        // The first sample is the other tree, which is the straight way.
+        // The first sample is the root of the other tree: this tries the straight motion.
         let sample = if iteration == 0 { ends[0] } else { samples.next(&lower, &upper) };
         let (near, _) = trees[growing].nearest(&sample);
         let node = extend(space, constraint, &mut trees[growing], near, &sample, control)
@@ -203,7 +203,7 @@ fn stopped(answer: Control, iterations: usize) -> ConnectError {
     if answer == Control::Cancelled { ConnectError::Cancelled } else { ConnectError::TimeUp { iterations } }
 }
 
-/// Adds the steps of a walk to a tree; the last node, which is `near` where there is none.
+/// Adds the steps of a walk to a tree; returns the last node, or `near` without any step.
 fn extend(
     space: &mut Space,
     constraint: &Constraint,
@@ -219,7 +219,7 @@ fn extend(
     Ok(node)
 }
 
-/// Postures on the constraint from one, which is left out, towards another, as far as they get.
+/// Postures on the constraint from a posture (excluded) towards another, as far as they get.
 pub(crate) fn walk(
     space: &mut Space,
     constraint: &Constraint,
@@ -249,10 +249,10 @@ pub(crate) fn walk(
     }
 }
 
-/// Makes a path shorter that keeps the constraint, and goes on keeping it, by so many attempts at shortcuts.
+/// Shortens a path that satisfies the constraint, and keeps it satisfied, by this number of attempts at shortcuts.
 ///
 /// # Errors
-/// What `control` said, when that was not to go on; the path is whole all the same.
+/// The answer of `control`, if it ends the planning; the path is valid all the same.
 pub fn shorten(
     space: &mut Space,
     constraint: &Constraint,

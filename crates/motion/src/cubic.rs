@@ -1,11 +1,11 @@
-//! What a trajectory does between two of its knots, in closed form: one joint's cubic with its extremes.
+//! A trajectory between two of its knots in closed form: one joint's cubic with its extremes.
 
 use crate::trajectory::Knot;
 
-/// One joint from one knot to the next: q + v t + a t² / 2 + j t³ / 6.
+/// One joint between two knots: q + v t + a t² / 2 + j t³ / 6.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct Cubic {
-    /// Seconds from knot to knot.
+    /// Seconds between the knots.
     pub(crate) lasts_s: f64,
     /// At the beginning.
     pub(crate) position: f64,
@@ -13,7 +13,7 @@ pub(crate) struct Cubic {
     pub(crate) velocity: f64,
     /// At the beginning.
     pub(crate) acceleration: f64,
-    /// All along.
+    /// Constant.
     pub(crate) jerk: f64,
 }
 
@@ -33,7 +33,7 @@ impl Cubic {
         }
     }
 
-    /// The position at a moment since its beginning.
+    /// The position at a time since the beginning.
     pub(crate) fn position_at(&self, t: f64) -> f64 {
         self.position + t * (self.velocity + t * (self.acceleration / 2.0 + t * self.jerk / 6.0))
     }
@@ -46,22 +46,22 @@ impl Cubic {
         self.acceleration + t * self.jerk
     }
 
-    /// The greatest absolute velocity.
+    /// The maximum absolute velocity.
     pub(crate) fn greatest_velocity(&self) -> f64 {
         let ends = self.velocity.abs().max(self.velocity_at(self.lasts_s).abs());
-        // Where the acceleration, which is linear, is zero.
+        // At the zero of the acceleration, which is linear.
         match self.turns_at(-self.acceleration / self.jerk) {
             Some(t) => ends.max(self.velocity_at(t).abs()),
             None => ends,
         }
     }
 
-    /// The greatest absolute acceleration: at one of the ends.
+    /// The maximum absolute acceleration: at one of the ends.
     pub(crate) fn greatest_acceleration(&self) -> f64 {
         self.acceleration.abs().max(self.acceleration_at(self.lasts_s).abs())
     }
 
-    /// The least and the greatest position from one moment to another.
+    /// The minimum and maximum position between two times.
     pub(crate) fn range(&self, from: f64, to: f64) -> [f64; 2] {
         let (a, b) = (self.position_at(from), self.position_at(to));
         let mut range = [a.min(b), a.max(b)];
@@ -79,7 +79,7 @@ impl Cubic {
         if square < 0.0 {
             return [None, None];
         }
-        // The roots without cancellation; one of them is nowhere if the velocity is linear.
+        // The roots without cancellation; one of them is not finite if the velocity is linear.
         let q = -0.5 * (b + square.sqrt().copysign(b));
         [self.turns_at(q / a), self.turns_at(c / q)]
     }

@@ -1,7 +1,7 @@
-//! Depth images as points: a pinhole camera's image, the distance along its axis per pixel, seen from where the camera is.
+//! Converts depth images to points: images of a pinhole camera, with the distance along its axis per pixel, for a given camera pose.
 //!
-//! Pixels without a value, too near or too far are left out. At the edge of a thing a camera often sees pixels that lie between the thing and
-//! what is behind it: flying pixels. They stand apart from their neighbours along the line of sight, and are left out where that is asked.
+//! Pixels without a value, too near or too far are left out. At the edge of an object a camera often returns pixels that lie between the object and
+//! the background: flying pixels. They are far from their neighbours along the line of sight, and are left out on request.
 
 use ratn_model::pose::Pose;
 
@@ -12,20 +12,20 @@ pub struct Intrinsics {
     pub size: [usize; 2],
     /// Focal lengths along x and y.
     pub focal: [f64; 2],
-    /// Where the axis meets the image; the centre of the first pixel is (0, 0).
+    /// The principal point, where the axis meets the image; the centre of the first pixel is (0, 0).
     pub centre: [f64; 2],
 }
 
-/// Which pixels count.
+/// Which pixels are used.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Filter {
-    /// Nearer ones do not, in metres.
+    /// Minimum depth, in metres.
     pub least_m: f64,
-    /// Nor do those that are further away, in metres.
+    /// Maximum depth, in metres.
     pub most_m: f64,
-    /// A pixel is flying where fewer than two of its eight neighbours are within this part of its depth; `None` keeps them.
+    /// A pixel is flying if fewer than two of its eight neighbours are within this share of its depth; `None` keeps all.
     pub flying: Option<f64>,
-    /// Only every so many columns and rows; 1 for all.
+    /// Only every n-th column and row; 1 for all.
     pub every: usize,
 }
 
@@ -38,32 +38,32 @@ impl Default for Filter {
 /// Why there are no points.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum DepthError {
-    /// Not as many as the camera has.
+    /// The numbers of pixels of image and camera differ.
     #[error("the image has {pixels} pixels, the camera {columns} × {rows}")]
     Pixels {
-        /// In the image.
+        /// Pixels of the image.
         pixels: usize,
-        /// Of the camera.
+        /// Columns of the camera.
         columns: usize,
-        /// Of the camera.
+        /// Rows of the camera.
         rows: usize,
     },
-    /// A camera or a filter that cannot be.
+    /// An invalid value of the camera or the filter.
     #[error("{what} is {value}: expected {expected}")]
     Value {
-        /// Which value.
+        /// The name of the value.
         what: &'static str,
-        /// What it is.
+        /// The value.
         value: f64,
-        /// What it should be.
+        /// The allowed values.
         expected: &'static str,
     },
 }
 
-/// The points of an image, row by row, in the frame in which `camera` is given; depths in metres, zero or not a number where there is none.
+/// The points of an image, row by row, in the frame of `camera`'s pose; depths in metres, zero or NaN for none.
 ///
 /// # Errors
-/// [`DepthError`] says what does not fit.
+/// [`DepthError`] says what is invalid.
 pub fn points(
     depths: &[f32],
     intrinsics: &Intrinsics,
@@ -96,7 +96,7 @@ pub fn points(
         let around = |at: usize, count: usize| at.saturating_sub(1)..=(at + 1).min(count - 1);
         let pixels = around(row, rows).flat_map(|y| around(column, columns).map(move |x| (x, y)));
         let close = |(x, y): &(usize, usize)| depth(*x, *y).is_some_and(|d| (d - here).abs() <= part * here);
-        // The pixel itself is close, too.
+        // The pixel itself counts as well.
         pixels.filter(close).count() < 3
     };
     let mut points = Vec::new();
@@ -121,7 +121,7 @@ mod tests {
 
     #[test]
     fn a_wall_seen_straight_is_a_wall_where_it_is() {
-        // One metre up, looking along the world's x axis: its z is the world's x, its x the world's -y.
+        // One metre up, looking along the world's x axis: the camera's z is the world's x, its x the world's -y.
         let camera = Pose::from_rpy([0.0, 0.0, 1.0], -std::f64::consts::FRAC_PI_2, 0.0, -std::f64::consts::FRAC_PI_2);
         let seen = points(&[2.0; 48], &CAMERA, &camera, &Filter::default()).unwrap();
         assert_eq!(seen.len(), 48);

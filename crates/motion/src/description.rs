@@ -1,6 +1,6 @@
 //! A robot as data: which of the joints and links of a URDF are its arm, gripper, base, head and camera (`robot.toml`).
 //!
-//! The built-in robots are read the same way. [`Robot::of`](crate::robot::Robot::of) holds the names against the URDF.
+//! The built-in robots are read the same way. [`Robot::of`](crate::robot::Robot::of) checks the names against the URDF.
 
 use crate::mechanism::MechanismError;
 use crate::mesh::MeshError;
@@ -13,18 +13,18 @@ use std::path::{Path, PathBuf};
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-/// What a `robot.toml` says.
+/// The content of a `robot.toml`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RobotDescription {
-    /// What messages call it.
+    /// The robot's name in messages.
     pub name: String,
-    /// The URDF; seen from the folder of the file that names it, as are all paths.
+    /// The path of the URDF; relative to the folder of this file, as are all paths.
     pub urdf: PathBuf,
-    /// The SRDF: which links are not checked against each other. Without it, that is found out from how links meet.
+    /// The SRDF: which links are not checked against each other. Without it, these are computed from how links meet.
     #[serde(default)]
     pub srdf: Option<PathBuf>,
-    /// Where `package://NAME/…` leads: folders that hold packages, or are one.
+    /// The folders for `package://NAME/…`: they contain packages, or are one.
     #[serde(default)]
     pub packages: Vec<PathBuf>,
     /// The arm, or the first one.
@@ -35,16 +35,16 @@ pub struct RobotDescription {
     /// The gripper. A robot without one grasps nothing.
     #[serde(default)]
     pub gripper: Option<GripperDescription>,
-    /// A base that drives. A robot without one stands where its URDF puts it.
+    /// A base that drives. A robot without one stands where its URDF places it.
     #[serde(default)]
     pub base: Option<BaseDescription>,
-    /// A pan-tilt unit that carries the camera. Without it the camera looks where the URDF has it.
+    /// A pan-tilt unit that carries the camera. Without it the camera has the fixed direction of the URDF.
     #[serde(default)]
     pub head: Option<HeadDescription>,
     /// The camera.
     #[serde(default)]
     pub camera: Option<CameraDescription>,
-    /// Postures of the arm by name, in radians (metres for a joint that slides), in the order of its joints.
+    /// Postures of the arm by name, in radians (metres for a prismatic joint), in the order of its joints.
     #[serde(default)]
     pub postures: BTreeMap<String, Vec<f64>>,
     /// The table, the boxes and their places, for a cell.
@@ -56,17 +56,17 @@ pub struct RobotDescription {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ArmDescription {
-    /// What goals call it.
+    /// The arm's name in goals.
     #[serde(default = "arm")]
     pub name: String,
     /// Its joints, from the foot to the tool.
     pub joints: Vec<String>,
-    /// The link whose frame is brought to goals: z points the way the gripper reaches, y along which the fingers close.
+    /// The link whose frame is moved to goals: its z axis points in the approach direction of the gripper, y is the closing direction of the fingers.
     pub tool: String,
-    /// Its gripper; that of the first arm is the robot's.
+    /// Its gripper; the first arm's gripper is that of the robot.
     #[serde(default)]
     pub gripper: Option<GripperDescription>,
-    /// Its postures, as those of the first arm are the robot's; in the one called `home` it stands unless a goal says where.
+    /// Its postures; the first arm's postures are those of the robot. The arm stands in the posture `home` unless a goal says otherwise.
     #[serde(default)]
     pub postures: BTreeMap<String, Vec<f64>>,
 }
@@ -75,15 +75,15 @@ fn arm() -> String {
     "arm".to_owned()
 }
 
-/// A gripper of two fingers that close on the middle.
+/// A gripper of two fingers that close towards the middle.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GripperDescription {
-    /// The joint that slides one finger, from 0 where they meet: its position is half of the opening. The other finger's joint mimics it.
+    /// The prismatic joint of one finger, 0 where the fingers meet: its position is half of the opening. The other finger's joint mimics it.
     pub joint: String,
-    /// The link that both fingers hang on.
+    /// The link to which both fingers are attached.
     pub hand: String,
-    /// The link of one finger, of which the thickness is taken.
+    /// The link of one finger, which gives the fingers' thickness.
     pub finger: String,
 }
 
@@ -91,11 +91,11 @@ pub struct GripperDescription {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BaseDescription {
-    /// Its x, its y and its heading, in this order.
+    /// The joints of x, y and heading, in this order.
     pub joints: [String; 3],
-    /// The link of its body: what stands on top of it rides along.
+    /// The link of its body: objects on top of it ride on the base.
     pub body: String,
-    /// Where it may drive, as far as the limits of its joints allow. Without it these alone count.
+    /// The area in which it may drive, within the limits of its joints. Without it only the limits count.
     #[serde(default)]
     pub area: Option<DriveArea>,
 }
@@ -104,9 +104,9 @@ pub struct BaseDescription {
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DriveArea {
-    /// Least and greatest x of the base.
+    /// Minimum and maximum x of the base.
     pub x: [f64; 2],
-    /// Least and greatest y.
+    /// Minimum and maximum y of the base.
     pub y: [f64; 2],
 }
 
@@ -126,7 +126,7 @@ pub struct CameraDescription {
     pub link: String,
 }
 
-/// Why a file describes no robot.
+/// Why a file does not describe a robot.
 #[derive(Debug, thiserror::Error)]
 pub enum DescriptionError {
     /// A file cannot be read.
@@ -134,31 +134,31 @@ pub enum DescriptionError {
     Read {
         /// The file.
         file: PathBuf,
-        /// What the system says.
+        /// The system's error message.
         reason: String,
     },
-    /// It is not TOML of this form.
+    /// The file is not TOML of this form.
     #[error("{}: {reason}", file.display())]
     Form {
         /// The file.
         file: PathBuf,
-        /// Line, column and what does not fit.
+        /// Line, column and the error.
         reason: String,
     },
-    /// Its names do not fit the URDF.
+    /// Names in the file do not fit the URDF.
     #[error("{}: {}{fault}", file.display(), line.map_or_else(String::new, |line| format!("line {line}: ")))]
     Fault {
         /// The file.
         file: PathBuf,
-        /// Where it names what does not fit, from 1.
+        /// The line of the wrong name, from 1.
         line: Option<usize>,
-        /// What does not fit.
+        /// The error.
         fault: Box<RobotFault>,
     },
 }
 
 impl DescriptionError {
-    /// Whether a file is missing or cannot be read, a mesh included; else a file says something wrong.
+    /// Whether a file, which may be a mesh, is missing or cannot be read; otherwise a file has wrong content.
     pub fn is_unreadable(&self) -> bool {
         match self {
             DescriptionError::Read { .. } => true,
@@ -175,7 +175,7 @@ impl RobotDescription {
     /// Reads the text of a `robot.toml`.
     ///
     /// # Errors
-    /// Line, column and what does not fit.
+    /// Line, column and the error.
     pub fn read(text: &str) -> Result<RobotDescription, String> {
         let read: RobotDescription = toml::from_str(text).map_err(|error| error.to_string().trim_end().to_owned())?;
         if read.arm.gripper.is_some() || !read.arm.postures.is_empty() {
@@ -190,7 +190,7 @@ impl Robot {
     /// The built-in robot of this name, or the one that a `robot.toml` describes.
     ///
     /// # Errors
-    /// [`DescriptionError`] names the file and what does not fit.
+    /// [`DescriptionError`] names the file and the error.
     pub fn named_or_file(robot: &str) -> Result<Robot, DescriptionError> {
         match Robot::built_in(robot) {
             Some(robot) => Ok(robot),
@@ -201,12 +201,12 @@ impl Robot {
     /// The robot that a `robot.toml` describes, with its URDF, SRDF and meshes.
     ///
     /// # Errors
-    /// [`DescriptionError`] names the file and what does not fit.
+    /// [`DescriptionError`] names the file and the error.
     pub fn from_file(file: &Path) -> Result<Robot, DescriptionError> {
         let Files { text, description, urdf_file, urdf, srdf_file, meshes } = Files::read(file)?;
         let srdf = srdf_file.as_deref().map(read_text).transpose()?;
         let fault = |fault| {
-            // A line is one of the file that has it.
+            // Names the file to which the error's line belongs.
             let file = match &fault {
                 RobotFault::Model(MechanismError::Robot(RobotError::Fault(_) | RobotError::Urdf(_))) => &urdf_file,
                 RobotFault::Model(MechanismError::Srdf(_)) => srdf_file.as_deref().unwrap_or(file),
@@ -219,7 +219,7 @@ impl Robot {
     }
 }
 
-/// What a `robot.toml` says, and the files that it names.
+/// The content of a `robot.toml`, and the files that it names.
 pub(crate) struct Files {
     text: String,
     description: RobotDescription,
@@ -227,7 +227,7 @@ pub(crate) struct Files {
     /// The text of the URDF.
     pub(crate) urdf: String,
     srdf_file: Option<PathBuf>,
-    /// Where the meshes are that the URDF names.
+    /// Where to find the meshes of the URDF.
     pub(crate) meshes: MeshFiles,
 }
 
@@ -247,7 +247,7 @@ impl Files {
     }
 }
 
-/// The line of a `robot.toml` in which a value is this text, from 1; the first one of several.
+/// The line of a `robot.toml` with this text as a value, from 1; the first one if there are several.
 fn line_of(text: &str, name: &str) -> Option<usize> {
     let read = DeTable::parse(text).ok()?;
     let mut first: Option<usize> = None;

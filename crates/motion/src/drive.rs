@@ -1,8 +1,8 @@
-//! Driving: paths of the base on the floor, in x, y and heading, among what stands there.
+//! Driving: paths of the base on the floor, in x, y and heading, among obstacles.
 //!
-//! The base with all that rides on it, in the posture that it is in, is one body moved by two sliding joints and a turning one;
-//! the search is that of the arm. A heading is the same after a whole turn, so every goal is offered with its turns, and the
-//! nearest is taken. Lengths count metres and radians alike.
+//! The base with everything that rides on it, in its current posture, is one body moved by two prismatic joints and a revolute one; the search is
+//! that of the arm. A heading is the same after a whole turn, so every goal is offered in several turns, and the nearest is used. Lengths add metres
+//! and radians without weights.
 
 use crate::connect::{Budget, ConnectError, connect};
 use crate::geometry::Body;
@@ -18,19 +18,19 @@ use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene};
 use std::f64::consts::TAU;
 
-/// How far the spheres may stand out of what drives, in metres.
+/// Maximum distance by which the spheres may stand out of the vehicle, in metres.
 const OVERHANG_M: f64 = 0.03;
 
-/// Where something may drive and what it is.
+/// A vehicle, and where it may drive.
 #[derive(Debug, Clone)]
 pub struct Vehicle {
-    /// Everything that moves along, in the frame of the base.
+    /// Everything that moves with it, in the frame of the base.
     pub bodies: Vec<Body>,
-    /// Least and greatest x, least and greatest y, in metres.
+    /// Minimum and maximum x, minimum and maximum y, in metres.
     pub area: [[f64; 2]; 2],
-    /// Least and greatest heading, in radians; without them it turns on and on.
+    /// Minimum and maximum heading, in radians; without them it can rotate without end.
     pub heading: Option<[f64; 2]>,
-    /// Room that it keeps, in metres.
+    /// Distance that it keeps from obstacles, in metres.
     pub padding_m: f64,
 }
 
@@ -41,8 +41,8 @@ impl Vehicle {
         Vehicle { bodies: vec![geometry.at(Pose::at(0.0, 0.0, height / 2.0))], area, heading: None, padding_m }
     }
 
-    /// A robot as it stands, with what it holds and the objects of the scene that ride on it; and what it may not touch. It drives in the
-    /// robot's area; one without a base does not.
+    /// A robot in its current posture, with the objects that it holds and those of the scene that ride on it, and the obstacles. It drives in the
+    /// robot's area; a robot without a base does not drive.
     pub fn of(
         robot: &Robot,
         scene: &Scene,
@@ -74,7 +74,7 @@ impl Vehicle {
         (Vehicle { bodies, area, heading, padding_m }, obstacles)
     }
 
-    /// A heading as its own joint has it: within half a turn of zero, or a turn away where the limits are elsewhere.
+    /// A heading as a position of its joint: within half a turn of zero, or a turn away if the limits are elsewhere.
     fn heading_of(&self, heading: f64) -> f64 {
         let near = wrapped(heading);
         let within = |turned: &f64| self.heading.is_none_or(|[least, greatest]| (least..=greatest).contains(turned));
@@ -108,8 +108,8 @@ impl Vehicle {
     }
 }
 
-/// A short path on the floor from `start` to one of `goals`, each x and y in metres and heading in radians; straight motions
-/// between its places, free all along. The heading at its end is a goal's up to whole turns. Gives the goal's index too.
+/// A short path on the floor from `start` to one of `goals`, each x and y in metres and heading in radians; the motions between its places are
+/// straight and free. The heading at its end equals a goal's up to whole turns. Also returns the goal's index.
 ///
 /// # Errors
 /// [`ConnectError`] says why there is none.

@@ -1,10 +1,10 @@
-//! Which turns of the elbow keep an arm within the limits of its joints.
+//! Which elbow angles (also called arm angles or swivel angles) keep an arm within its joint limits.
 //!
-//! With the tool's pose held, every entry of the shoulder's and of the wrist's rotation is `A sin t + B cos t + C` in the turn
-//! `t` of the elbow. So is what is zero where a joint is at a limit: each limit cuts the circle of turns at two places at the
-//! most, and between two neighbouring cuts an arm is within its limits everywhere or nowhere (Shimizu, Kakuya, Yoon, Kitagaki,
-//! Kosuge: *Analytical Inverse Kinematic Computation for 7-DOF Redundant Manipulators With Joint Limits and Its Application to
-//! Redundancy Resolution*, IEEE T-RO 24(5), 2008). A pose that can be reached at all is found this way, however small the arc.
+//! With a fixed tool pose, every entry of the shoulder's and of the wrist's rotation is `A sin t + B cos t + C` in the elbow angle `t`. The same
+//! holds for the functions that are zero where a joint is at a limit: each limit cuts the circle of angles at two places at most, and between two
+//! neighbouring cuts an arm is within its limits everywhere or nowhere (Shimizu, Kakuya, Yoon, Kitagaki, Kosuge: *Analytical Inverse Kinematic
+//! Computation for 7-DOF Redundant Manipulators With Joint Limits and Its Application to Redundancy Resolution*, IEEE T-RO 24(5), 2008). So every
+//! reachable pose is found, however small the arc.
 
 use crate::joint_vector::JointVector;
 use crate::robot::Joint;
@@ -13,42 +13,42 @@ use crate::vector::rotate;
 use ratn_model::pose::Pose;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-/// What is closest to an arc is this share of its width inside of it.
+/// The angle of an arc that is closest to an outside angle is inside by this share of the width.
 const INSIDE: f64 = 1e-3;
 
-/// Turns of the elbow with one bend of it, between which some posture is within the limits.
+/// An interval of elbow angles, for one elbow bend, with postures within the limits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Arc {
-    /// How far the elbow is bent, in radians.
+    /// The elbow's bend, in radians.
     pub bend: f64,
-    /// The first turn, in radians, within half a turn of zero.
+    /// The first elbow angle, in radians, within half a turn of zero.
     pub from: f64,
-    /// How far it goes on from there, at most a whole turn.
+    /// The width of the interval, at most a whole turn.
     pub width: f64,
 }
 
 impl Arc {
-    /// The turn of this arc that is closest to another one, and how far that is.
+    /// The elbow angle of this arc that is closest to `turn`, and its distance.
     pub(crate) fn nearest(&self, turn: f64) -> (f64, f64) {
         let beyond = (turn - self.from).rem_euclid(TAU);
         if beyond <= self.width {
             return (turn, 0.0);
         }
         let (past_end, before_start) = (beyond - self.width, TAU - beyond);
-        // At the very end a joint is at its limit and rounding decides.
+        // Exactly at the end a joint is at its limit, and rounding decides.
         let inside = self.width * INSIDE;
         let end_is_nearer = past_end < before_start;
         if end_is_nearer { (self.from + self.width - inside, past_end) } else { (self.from + inside, before_start) }
     }
 }
 
-/// All arcs of the turns that reach a pose within the limits, which are in the order of the positions.
+/// All arcs of elbow angles that reach a pose within the limits, which are in the order of the positions.
 pub(crate) fn arcs(arm: &Spherical, target: &Pose, limits: &[Joint]) -> Vec<Arc> {
     let mut arcs = Vec::new();
     let others = JointVector::zeros(limits.len());
     for bend in arm.bends_for(target) {
         let within = |turn: f64| {
-            // Joints that are none of the arm's are wherever they are.
+            // Joints that do not belong to the arm keep their positions.
             let is_within = |posture: &JointVector| {
                 arm.joints.iter().all(|i| (limits[*i].lower..=limits[*i].upper).contains(&posture[*i]))
             };
@@ -68,7 +68,7 @@ pub(crate) fn arcs(arm: &Spherical, target: &Pose, limits: &[Joint]) -> Vec<Arc>
     arcs
 }
 
-/// The turns at which a joint may be at one of its limits, or a shoulder or a wrist stretched; sorted, at least one.
+/// The elbow angles at which a joint may be at one of its limits, or a shoulder or wrist is stretched; sorted, at least one.
 fn cuts(arm: &Spherical, target: &Pose, bend: f64, limits: &[Joint]) -> Vec<f64> {
     let rotations = [0.0, FRAC_PI_2, PI].map(|turn| arm.rotations(target, bend, turn));
     let mut cuts = Vec::new();
@@ -95,7 +95,7 @@ fn cuts(arm: &Spherical, target: &Pose, bend: f64, limits: &[Joint]) -> Vec<f64>
             let seen = a.dot(rotate(&about(b, limit), c));
             cut(&|rotation| a.dot(rotate(rotation, c)) - seen);
         }
-        // Where the outer axes are in line the two ways to make a rotation change over.
+        // Where the outer axes are aligned, the two solutions for a rotation meet.
         let size = a.dot(c).hypot(a.dot(b.cross(c)));
         for seen in [size, -size] {
             cut(&|rotation| a.dot(rotate(rotation, c)) - seen);

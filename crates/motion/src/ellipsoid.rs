@@ -1,13 +1,13 @@
-//! Postures that a path of a given length from one posture to another can lead through: an ellipsoid with the two as foci
-//! (Gammell, Srinivasa, Barfoot: *Informed RRT\**, IROS 2014), drawn from directly instead of by rejection.
+//! Samples postures through which a path of a given length between two postures can lead: an ellipsoid with the two as foci (Gammell, Srinivasa,
+//! Barfoot: *Informed RRT\**, IROS 2014), sampled directly instead of by rejection.
 
 use crate::space::{State, difference, distance};
 use rand::{Rng, RngExt};
 
-/// Draws before one outside the limits is held within them.
+/// Number of draws before one outside of the limits is clamped.
 const MAX_DRAWS: usize = 16;
 
-/// A posture on some path from `from` to `to` that is no longer than `length`, and within the limits.
+/// A posture within the limits on some path from `from` to `to` that is not longer than `length`.
 pub(crate) fn draw(
     from: &State,
     to: &State,
@@ -18,7 +18,7 @@ pub(crate) fn draw(
 ) -> State {
     let between = distance(from, to);
     let along = difference(to, from);
-    // Half of the long axis, and of all others.
+    // Half of the long axis, and of all other axes.
     let (long, short) = (length / 2.0, (length * length - between * between).max(0.0).sqrt() / 2.0);
     let mut state = *from;
     for _ in 0..MAX_DRAWS {
@@ -43,12 +43,12 @@ pub(crate) fn draw(
     state
 }
 
-/// A point of the unit ball, evenly.
+/// A uniform sample of the unit ball.
 fn in_unit_ball(joints: usize, random: &mut impl Rng) -> State {
     let mut point = State::default();
     let mut square = 0.0;
     for value in &mut point[..joints] {
-        // The sum of twelve is normal enough to have no direction.
+        // The sum of twelve uniform samples is close enough to normal to prefer no direction.
         *value = (0..12).map(|_| random.random_range(-0.5_f32..0.5)).sum();
         square += *value * *value;
     }

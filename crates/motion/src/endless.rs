@@ -1,8 +1,8 @@
-//! Joints that turn without end: the same posture a whole turn later, so the way to it is the short one.
+//! Continuous joints: the posture is the same after a whole turn, so the shortest way to it is used.
 //!
-//! A search needs a range. It has one in which the joint counts its turns otherwise: the start is turned back by whole turns to be near zero, where
-//! numbers are the most exact, and the goals to be near the start; a goal is also taken the other way round, for where the short way is blocked.
-//! What is found is counted as before again. So a path begins where the problem does, and may end whole turns from the goal that was given.
+//! A search needs limits. For the search the turns are counted differently: the start is moved by whole turns to be near zero, where floating-point
+//! numbers are most exact, and the goals to be near the start; each goal is also offered the other way round, in case the short way is blocked.
+//! Results are converted back. So a path begins at the problem's start, and may end whole turns from the given goal.
 
 use crate::drive::wrapped;
 use crate::joint_vector::JointVector;
@@ -16,7 +16,7 @@ use std::f64::consts::TAU;
 /// How far beyond the ends of a path a joint may turn, in radians.
 const BESIDE: f64 = TAU / 4.0;
 
-/// What is wrong with positions of joints that turn without end; `which` of the problem's ends they are begins each line.
+/// Errors for positions of continuous joints; each begins with `which`, the end of the problem that they belong to.
 pub(crate) fn wound_too_far(mechanism: &Mechanism, positions: &[f64], which: &str) -> Vec<String> {
     let joints = mechanism.joints.iter().zip(positions);
     let far = joints.filter(|(joint, position)| joint.endless && !joint.allows(**position, 0.0));
@@ -30,12 +30,12 @@ pub(crate) fn wound_too_far(mechanism: &Mechanism, positions: &[f64], which: &st
     .collect()
 }
 
-/// A joint with ends, for a search.
+/// A joint with limits, for a search.
 fn bounded(joint: &Joint, lower: f64, upper: f64) -> Joint {
     Joint { lower, upper, endless: false, ..joint.clone() }
 }
 
-/// A way to a goal the other way round.
+/// The displacement to the same position the other way round.
 fn around(way: f64) -> f64 {
     if way > 0.0 { way - TAU } else { way + TAU }
 }
@@ -43,16 +43,16 @@ fn around(way: f64) -> f64 {
 /// A problem in which joints turn the short way.
 #[derive(Debug, Clone)]
 pub(crate) struct Unwound {
-    /// The robot with ranges about the ends of the problem.
+    /// The robot with joint limits around the ends of the problem.
     pub(crate) mechanism: Mechanism,
     pub(crate) start: Vec<f64>,
-    /// The nearest first; each of the others has one joint go the other way round.
+    /// The nearest goal first; in each of the others one joint goes the other way round.
     pub(crate) goals: Vec<Vec<f64>>,
-    /// By how much each joint was turned back.
+    /// How far each joint was turned back, in radians.
     turned: Vec<f64>,
 }
 
-/// The problem from a start to a goal; as it is where no joint turns without end.
+/// The problem from a start to a goal; unchanged without continuous joints.
 pub(crate) fn unwound(mechanism: &Mechanism, start: &[f64], goal: &[f64]) -> Unwound {
     let mut unwound = Unwound {
         mechanism: mechanism.clone(),
@@ -78,26 +78,26 @@ pub(crate) fn unwound(mechanism: &Mechanism, start: &[f64], goal: &[f64]) -> Unw
 }
 
 impl Unwound {
-    /// A posture as the problem counts turns.
+    /// A posture with the problem's count of turns.
     pub(crate) fn wound(&self, posture: &[f64]) -> Vec<f64> {
         posture.iter().zip(&self.turned).map(|(q, turned)| q + turned).collect()
     }
 }
 
-/// A robot whose arm has ends: one motion turns each joint by a turn at the most, to either side.
+/// A robot whose arm has joint limits: one motion turns each joint by at most a turn, in either direction.
 #[derive(Debug, Clone)]
 pub(crate) struct WithEnds {
     pub(crate) robot: Robot,
-    /// Where the arm is there.
+    /// The arm's start posture in this robot.
     pub(crate) start: JointVector,
-    /// By how much each joint was turned back.
+    /// How far each joint was turned back, in radians.
     turned: JointVector,
-    /// Which joints have no ends really.
+    /// The continuous joints.
     endless: Vec<usize>,
 }
 
 impl WithEnds {
-    /// For motions from a posture; of an arm none of whose joints turns without end there is none, because it is what it is.
+    /// For motions from a posture; `None` for an arm without continuous joints.
     pub(crate) fn about(robot: &Robot, start: &JointVector) -> Option<WithEnds> {
         let joints = robot.arm_joints();
         let endless: Vec<usize> = (0..joints.len()).filter(|j| joints[*j].endless).collect();
@@ -114,7 +114,7 @@ impl WithEnds {
         Some(WithEnds { robot, start: near, turned, endless })
     }
 
-    /// What is asked for, as this robot counts.
+    /// The request with this robot's count of turns.
     pub(crate) fn request(&self, request: &Request) -> Request {
         let mut asked = Request { goals: Vec::new(), ..request.clone() };
         asked.start.arm = self.start;
@@ -127,7 +127,7 @@ impl WithEnds {
         asked
     }
 
-    /// A posture, the nearest way first; on each of the other ways one joint goes the other way round.
+    /// The goal postures for a posture, the nearest first; in each of the others one joint goes the other way round.
     fn ways_to(&self, posture: &JointVector) -> impl Iterator<Item = JointVector> {
         let mut nearest = *posture;
         for &j in &self.endless {
@@ -141,7 +141,7 @@ impl WithEnds {
         std::iter::once(nearest).chain(self.endless.iter().map(other))
     }
 
-    /// A motion as the arm itself counts its turns.
+    /// A motion with the arm's own count of turns.
     pub(crate) fn wound(&self, mut plan: Plan) -> Plan {
         let wind = |positions: &mut [f64]| positions.iter_mut().zip(&self.turned).for_each(|(q, turned)| *q += turned);
         plan.trajectory.points.iter_mut().for_each(|point| wind(&mut point.positions));

@@ -1,9 +1,9 @@
-//! Composition of poses for the inner loops, without the normalisation that [`Pose::compose`] adds: eleven links in a chain
-//! lose nothing that matters.
+//! Composition of poses for the inner loops, without the normalisation that [`Pose::compose`] adds: for a chain of eleven links the loss of precision
+//! is negligible.
 
 use ratn_model::pose::Pose;
 
-/// `a` followed by `b` as seen from `a`.
+/// `a` followed by `b`, which is given in the frame of `a`.
 #[inline]
 pub(crate) fn compose(a: &Pose, b: &Pose) -> Pose {
     let [ax, ay, az, aw] = a.quaternion_xyzw;
@@ -20,7 +20,7 @@ pub(crate) fn compose(a: &Pose, b: &Pose) -> Pose {
     }
 }
 
-/// The vector turned by the pose's rotation.
+/// The vector rotated by the pose's rotation.
 #[inline]
 pub(crate) fn rotate(pose: &Pose, v: [f64; 3]) -> [f64; 3] {
     let [x, y, z, w] = pose.quaternion_xyzw;

@@ -1,4 +1,4 @@
-//! Primitive shapes, and how parry3d sees them.
+//! Primitive shapes, and their conversion to parry3d.
 
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
@@ -6,18 +6,18 @@ use ratn_model::pose::Pose;
 /// A primitive shape fixed to a link.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Body {
-    /// In the link's frame.
+    /// Its pose in the link's frame.
     pub pose: Pose,
-    /// What it is.
+    /// Its shape.
     pub geometry: Geometry,
 }
 
-/// A primitive, centred; axes along z. Metres.
+/// A primitive, centred at the origin, with its axis along z. In metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Geometry {
-    /// Half of the edge lengths.
+    /// A cuboid.
     Box {
-        /// Along x, y, z.
+        /// Half of the edge lengths along x, y, z.
         half: [f64; 3],
     },
     /// A cylinder.
@@ -57,7 +57,7 @@ impl Geometry {
                 SharedShape::cuboid(x, y, z)
             }
             Geometry::Cylinder { radius, half_length } => {
-                // parry's cylinder stands along y; `turn` says how ours lies.
+                // parry's cylinder is along y; `turn` rotates ours to it.
                 SharedShape::cylinder((half_length + padding) as f32, (radius + padding) as f32)
             }
             Geometry::Capsule { radius, half_length } => {
@@ -67,7 +67,7 @@ impl Geometry {
         }
     }
 
-    /// This, `padding` metres larger on every side.
+    /// The geometry grown by `padding` metres on every side.
     pub(crate) fn grown(&self, padding: f64) -> Geometry {
         match *self {
             Geometry::Box { half } => Geometry::Box { half: half.map(|h| h + padding) },
@@ -92,7 +92,7 @@ impl Geometry {
         Body { pose: pose.compose(&self.turn()), geometry: self }
     }
 
-    /// How far the shape reaches from its centre along the axes of the world, where it has this pose, its axis along z.
+    /// How far the shape extends from its centre along the axes of the world, at this pose, with its axis along z.
     pub(crate) fn extents(&self, pose: &Pose) -> [f64; 3] {
         let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| pose.rotate(axis));
         std::array::from_fn(|i| {
@@ -107,7 +107,7 @@ impl Geometry {
         })
     }
 
-    /// The radius of a sphere about the centre that holds the shape.
+    /// The radius of the sphere about the centre that contains the shape.
     pub fn radius(&self) -> f64 {
         match *self {
             Geometry::Box { half: [x, y, z] } => (x * x + y * y + z * z).sqrt(),

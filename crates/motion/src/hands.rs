@@ -1,21 +1,20 @@
-//! What the hands of a robot with several arms hold: as the arm sees it that is planned for, and as the base drives with it.
+//! Objects in the hands of a robot with several arms: for planning one arm, and for driving the base.
 
 use crate::robot::{Robot, RobotFault};
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene};
 
-/// The scene without [`Placement::Hand`], as motions of one arm are planned in it: what the arm holds itself moves with it, and what another arm
-/// holds is where that arm stands.
+/// The scene without [`Placement::Hand`], for planning one arm: objects that this arm holds move with it, and objects that another arm holds are
+/// placed where that arm stands.
 ///
 /// # Errors
-/// [`RobotFault::NoArm`] where something is in the hand of an arm that the robot does not have.
+/// [`RobotFault::NoArm`] if an object is in the hand of an arm that the robot does not have.
 pub fn seen_from(robot: &Robot, scene: Scene) -> Result<Scene, RobotFault> {
     let standing = robot.at_zero().with_base(&scene.base);
     with_others(robot, scene, |tool, _, pose| Placement::World(robot.poses(&standing)[tool].compose(&pose)))
 }
 
-/// The scene as the base drives in it: what any arm holds moves along. [`Placement::Hand`] is left for what another arm holds than the one that is
-/// planned for.
+/// The scene for driving the base: objects that any arm holds move along. [`Placement::Hand`] remains for those that another arm than the planned one holds.
 ///
 /// # Errors
 /// As [`seen_from`].
@@ -23,7 +22,7 @@ pub fn carried_by(robot: &Robot, scene: Scene) -> Result<Scene, RobotFault> {
     with_others(robot, scene, |_, arm, pose| Placement::Hand { arm, pose })
 }
 
-/// What the arm that is planned for holds is in its gripper; what another one holds is placed by the link of its tool, its name and the pose.
+/// Objects of the planned arm are placed in its gripper; those of another arm by `placed`, from its tool link, its name and the pose.
 fn with_others(
     robot: &Robot,
     mut scene: Scene,
@@ -39,7 +38,7 @@ fn with_others(
     Ok(scene)
 }
 
-/// The link that something hangs on which is in a hand, and its pose there. `None`: it is in no hand of this robot.
+/// The link that holds an object, and the object's pose in its frame; `None` if it is in no hand of this robot.
 pub(crate) fn holder(robot: &Robot, placement: &Placement) -> Option<(usize, Pose)> {
     match placement {
         Placement::World(_) => None,

@@ -1,15 +1,14 @@
-//! One value for each joint of a robot, of which there are as many as the robot has.
+//! One value for each joint of a robot, for any number of joints.
 //!
-//! [`JointVector`] is the one type for positions, velocities and limits in double precision: of an arm with six joints, of one with seven, of a base
-//! with three. It is held in place, so copying it allocates nothing. The search has a type of its own for what it does in vector
-//! registers, [`State`](crate::space::State).
+//! [`JointVector`] is the type for positions, velocities and limits in double precision: for an arm with six joints, one with seven, a base with
+//! three. It is stored inline, so copying it allocates nothing. The search uses its own type for vector registers, [`State`](crate::space::State).
 
 use crate::mechanism::MAX_JOINTS;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::fmt;
 use std::ops::{Deref, DerefMut};
 
-/// Positions in radians (metres where a joint slides), or velocities, in the order of the joints.
+/// Positions in radians (metres for prismatic joints), or velocities, in the order of the joints.
 pub type JointVector = PerJoint<f64>;
 
 /// At most [`MAX_JOINTS`] values, one per joint.
@@ -19,11 +18,11 @@ pub struct PerJoint<T> {
     count: u8,
 }
 
-/// More values than a robot has joints.
+/// There are more values than a robot can have joints.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{count} joints: at most {MAX_JOINTS} are supported")]
 pub struct TooManyJoints {
-    /// How many there are.
+    /// Number of values.
     pub count: usize,
 }
 
@@ -46,7 +45,7 @@ impl<T: Copy + Default> PerJoint<T> {
         PerJoint::from_fn(count, |_| value)
     }
 
-    /// As many values as there are, made of these.
+    /// Applies a function to each value.
     #[must_use]
     pub fn map<U: Copy + Default>(&self, mut of: impl FnMut(T) -> U) -> PerJoint<U> {
         PerJoint::from_fn(self.len(), |j| of(self.values[j]))
@@ -55,7 +54,7 @@ impl<T: Copy + Default> PerJoint<T> {
     /// Takes the values of a slice.
     ///
     /// # Errors
-    /// [`TooManyJoints`] where there are more than [`MAX_JOINTS`].
+    /// [`TooManyJoints`] if there are more than [`MAX_JOINTS`].
     pub fn read(values: &[T]) -> Result<PerJoint<T>, TooManyJoints> {
         if values.len() > MAX_JOINTS {
             return Err(TooManyJoints { count: values.len() });
@@ -65,7 +64,7 @@ impl<T: Copy + Default> PerJoint<T> {
 }
 
 impl PerJoint<f64> {
-    /// Of known values, also in a constant.
+    /// A vector of known values, also in a constant.
     pub const fn of<const N: usize>(known: [f64; N]) -> JointVector {
         assert!(N <= MAX_JOINTS, "too many joints");
         let mut values = [0.0; MAX_JOINTS];
@@ -77,13 +76,13 @@ impl PerJoint<f64> {
         PerJoint { values, count: N as u8 }
     }
 
-    /// Every one zero.
+    /// All values zero.
     pub const fn zeros(count: usize) -> JointVector {
         assert!(count <= MAX_JOINTS, "too many joints");
         PerJoint { values: [0.0; MAX_JOINTS], count: count as u8 }
     }
 
-    /// The values as an array of `N`; joints that are not there are zero.
+    /// The values as an array of `N`; missing joints are zero.
     pub(crate) fn padded<const N: usize>(&self) -> [f64; N] {
         std::array::from_fn(|j| self.get(j).copied().unwrap_or_default())
     }

@@ -1,7 +1,8 @@
-//! Chains of joints, and how far the end of one moves at the most while its joints do.
+//! Chains of joints, and upper bounds of how far the end of one moves when its joints do.
 //!
-//! A [`Chain`] is the one walk from the root to a link: for the tool's inverse kinematics, and for how far each shape of an arm can move. The end of a chain is no further from a joint's axis than its lever: the sum of all offsets that follow, and of all that can slide.
-//! These bounds hold in every posture. They say what cannot happen between two postures that were looked at.
+//! A [`Chain`] is the walk from the root to a link: for the tool's inverse kinematics, and for bounding the motion of each shape of an arm. The end
+//! of a chain is never farther from a joint's axis than its lever: the sum of all offsets that follow, and of the ranges of all prismatic joints.
+//! These bounds hold in every posture. They limit what can happen between two checked postures.
 
 use crate::joint_vector::JointVector;
 use crate::robot_model::{Drive, Joint, Link};
@@ -10,14 +11,14 @@ use ratn_model::pose::Pose;
 /// The joints between the root and a link.
 #[derive(Debug, Clone)]
 pub(crate) struct Chain {
-    /// From the root: where each moving link's joint sits in the frame before it.
+    /// From the root: for each joint that moves the link, its pose in the frame before it.
     pub(crate) joints: Vec<(Pose, Drive)>,
-    /// The link in the frame of the last joint.
+    /// The pose of the link in the frame of the last joint.
     pub(crate) tip: Pose,
 }
 
 impl Chain {
-    /// To the link with this index; `place` says where a link sits in its parent's frame, and what moves it there.
+    /// The chain to the link with this index; `place` returns a link's pose in its parent's frame, and its drive.
     pub(crate) fn to(link: usize, links: &[Link], place: impl Fn(&Link) -> (Pose, Option<Drive>)) -> Chain {
         let mut way: Vec<usize> = std::iter::successors(Some(link), |index| links[*index].parent).collect();
         way.reverse();
@@ -41,12 +42,12 @@ pub(crate) struct Levers(Vec<Lever>);
 #[derive(Debug, Clone, Copy)]
 struct Lever {
     drive: Drive,
-    /// How far the end moves per radian (1 for what slides, per metre).
+    /// How far the end moves per radian, in metres (1 for a prismatic joint, per metre).
     length_m: f64,
 }
 
 impl Levers {
-    /// Of joints, each at its place in the frame before it, and an end so far from the last.
+    /// The levers of joints, each with its pose in the frame before it, and an end at distance `end_m` from the last.
     pub(crate) fn new(chain: &[(Pose, Drive)], end_m: f64, joints: &[Joint]) -> Levers {
         let mut levers = Vec::with_capacity(chain.len());
         let mut beyond = end_m;
@@ -62,7 +63,7 @@ impl Levers {
         Levers(levers)
     }
 
-    /// How far the end moves at the most per radian of each joint (per metre of one that slides), in metres.
+    /// Maximum motion of the end per radian of each joint (per metre of a prismatic one), in metres.
     pub(crate) fn per_joint(&self, joints: usize) -> JointVector {
         let mut lengths = JointVector::zeros(joints);
         for Lever { drive, length_m } in &self.0 {
@@ -71,19 +72,19 @@ impl Levers {
         lengths
     }
 
-    /// How far the end moves at the most where no joint moves by more than so much, in metres.
+    /// Maximum motion of the end if no joint moves by more than `by`, in metres.
     pub(crate) fn moves_m(&self, by: &JointVector) -> f64 {
         self.0.iter().map(|lever| lever.amount(by) * lever.length_m).sum()
     }
 
-    /// How far it turns at the most, in radians.
+    /// Maximum rotation of the end, in radians.
     pub(crate) fn turns_rad(&self, by: &JointVector) -> f64 {
         self.0.iter().filter(|lever| !lever.drive.slides).map(|lever| lever.amount(by)).sum()
     }
 
-    /// How much the end's velocity changes at the most, where joints of these speeds move by so much, in metres per second.
+    /// Maximum change of the end's velocity if joints with these speeds move by `by`, in metres per second.
     pub(crate) fn swing_m(&self, by: &JointVector, speeds: &JointVector) -> f64 {
-        // As below, for two different amounts.
+        // As in `bend_m`, for two different amounts.
         let (mut turned, mut turning, mut sum) = (0.0, 0.0, 0.0);
         for lever in &self.0 {
             let (amount, speed) = (lever.amount(by), lever.amount(speeds));
@@ -95,10 +96,10 @@ impl Levers {
         sum
     }
 
-    /// How far the end is at the most from the straight line between its two places, where the joints go straight from one posture to
-    /// another that differs by so much, in metres: an eighth of the greatest second derivative.
+    /// Maximum distance of the end from the straight line between its two positions, if the joints move straight between two postures that differ by
+    /// `by`, in metres: an eighth of the maximum second derivative.
     pub(crate) fn bend_m(&self, by: &JointVector) -> f64 {
-        // ∂²p / ∂i ∂j with i before j is the axis of i times ∂p / ∂j, and nothing where i slides.
+        // ∂²p / ∂i ∂j with i before j is the axis of i times ∂p / ∂j, and zero if i is prismatic.
         let (mut before, mut second) = (0.0, 0.0);
         for lever in &self.0 {
             let amount = lever.amount(by);

@@ -1,8 +1,8 @@
-//! What a robot looks like: the visuals of its URDF, with their colours.
+//! The appearance of a robot: the visuals of its URDF, with their colours.
 //!
-//! Nothing is decided by them, so they are read apart from the robot, by whoever draws it, and a visual that cannot be read is named and
-//! left out. A visual has the colour of its material in the URDF, else the one of its mesh (Collada, or the
-//! materials beside an OBJ), else none. Textures are not read.
+//! Visuals affect no decision, so they are read separately from the robot, by the code that draws it; a visual that cannot be read is reported and
+//! left out. A visual has the colour of its material in the URDF, else the one of its mesh (Collada, or the materials beside an OBJ), else none.
+//! Textures are not read.
 
 use crate::description::{DescriptionError, Files};
 use crate::geometry::Body;
@@ -13,33 +13,33 @@ use ratn_model::pose::Pose;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Visuals of a robot at the most, and files of meshes that are read for them.
+/// Maximum number of visuals of a robot, and maximum number of mesh files for them.
 pub const MAX_VISUALS: usize = 4_096;
 /// See [`MAX_VISUALS`].
 pub const MAX_MESH_FILES: usize = 256;
 
-/// Colours of a file that are told apart.
+/// Maximum number of different colours of a file.
 const MAX_COLOURS: usize = 32;
 
-/// What a robot looks like.
+/// The visuals of a robot.
 #[derive(Debug, Clone, Default)]
 pub struct Looks {
-    /// In the order of the URDF. A file of several colours makes several.
+    /// In the order of the URDF. A file with several colours makes several visuals.
     pub visuals: Vec<Visual>,
-    /// The meshes of the visuals, of one colour each; those of a file once, however many visuals show it.
+    /// The meshes of the visuals, of one colour each; each file is read once, however many visuals use it.
     pub meshes: Vec<Mesh>,
-    /// What is not read.
+    /// The visuals that could not be read.
     pub lacks: Vec<Lack>,
 }
 
-/// A shape that is seen of a link.
+/// A visible shape of a link.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Visual {
     /// The name of its link.
     pub link: String,
-    /// What it is.
+    /// Its form.
     pub form: VisualForm,
-    /// Its colour, where it has one.
+    /// Its colour, if known.
     pub colour: Option<Colour>,
 }
 
@@ -50,24 +50,24 @@ pub enum VisualForm {
     Primitive(Body),
     /// A mesh.
     Mesh {
-        /// Its number among the robot's.
+        /// Its index in [`Looks::meshes`].
         mesh: usize,
-        /// Where its origin is.
+        /// The pose of its origin.
         pose: Pose,
     },
 }
 
-/// Something that is not seen.
+/// A visual that could not be read.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Lack {
-    /// The link; empty where it is of all of them.
+    /// The link; empty if it concerns all of them.
     pub link: String,
-    /// What, and why.
+    /// What is missing, and why.
     pub reason: String,
 }
 
 impl Looks {
-    /// Those of the robot of this name that we ship, or of the one that a `robot.toml` describes.
+    /// The visuals of the built-in robot of this name, or of the one that a `robot.toml` describes.
     pub fn named_or_file(robot: &str) -> Looks {
         let read = match Robot::built_in_urdf(robot) {
             Some(urdf) => Ok(Looks::read(urdf, &mut |_| Err(MeshError::Kind))),
@@ -78,7 +78,7 @@ impl Looks {
         read.unwrap_or_else(|error: DescriptionError| Looks::unread(error.to_string()))
     }
 
-    /// Those that a URDF describes; `load` gives what is in the file of a mesh.
+    /// The visuals of a URDF; `load` returns the content of a mesh file.
     pub fn read(urdf: &str, load: &mut dyn FnMut(&str) -> Result<Vec<u8>, MeshError>) -> Looks {
         let robot = match urdf::parse(urdf) {
             Ok((robot, _)) => robot,
@@ -106,7 +106,7 @@ impl Looks {
     }
 }
 
-/// The colours of materials by name: those of the robot, then those that visuals say.
+/// The colours of materials by name: first those of the robot, then those defined in visuals.
 fn materials(robot: &urdf_rs::Robot) -> BTreeMap<&str, Colour> {
     let of_visuals = robot.links.iter().flat_map(|link| &link.visual).filter_map(|visual| visual.material.as_ref());
     let mut named = BTreeMap::new();
@@ -123,21 +123,21 @@ fn own_colour(material: &urdf_rs::Material) -> Option<Colour> {
     Some([red, green, blue])
 }
 
-/// What is not a number is dark.
+/// Clamps a colour; NaN becomes 0.
 fn proper(colour: Colour) -> Colour {
     colour.map(|part| if part.is_nan() { 0.0 } else { part.clamp(0.0, 1.0) })
 }
 
-/// What came of a file: its meshes by their numbers, with their colours, or why there are none.
+/// The result for a file: its meshes by index, with their colours, or the reason why there are none.
 type FileRead = Result<Vec<(usize, Option<Colour>)>, String>;
 /// The corners of a triangle.
 type Corners = [[f64; 3]; 3];
 
 struct Reader<'l> {
     load: &'l mut dyn FnMut(&str) -> Result<Vec<u8>, MeshError>,
-    /// By name and scale, the numbers of the meshes of a file with their colours, or why there are none.
+    /// The results by file name and scale.
     files: BTreeMap<(String, [u64; 3]), FileRead>,
-    /// Of all meshes so far.
+    /// Number of triangles of all meshes so far.
     triangles: usize,
     looks: Looks,
 }
@@ -175,7 +175,7 @@ impl Reader<'_> {
             return Err(format!("at most {MAX_MESH_FILES} files are read"));
         }
         let bytes = (self.load)(name).map_err(|error| error.to_string())?;
-        // Materials are looked for beside their mesh, and nowhere else.
+        // Materials are looked for only in the folder of their mesh.
         let folder = name.rfind('/').map_or("", |end| &name[..=end]);
         let beside = &mut |file: &str| {
             let file = file.rsplit(['/', '\\']).next().unwrap_or(file);
@@ -189,7 +189,7 @@ impl Reader<'_> {
                 "it has {count} triangles, behind {all} of other files: expected 1 to {MAX_TRIANGLES} in all"
             ));
         }
-        // Triangles of one colour are one mesh, wherever they stand.
+        // All triangles of one colour are one mesh.
         let mut by_colour: Vec<(Option<Colour>, Vec<Corners>)> = Vec::new();
         for mut part in parts {
             let known = by_colour.iter().position(|(colour, _)| *colour == part.colour);

@@ -1,35 +1,35 @@
-//! Spheres that hold a mesh, few and close to it.
+//! Covers a mesh with few, tight spheres.
 //!
-//! The mesh is put into a fine grid: the cells that the surface passes through and those that it closes in are its own. They are joined in blocks, and
-//! of each block the box of its own cells is to be held. About the middle of each box there may be a sphere, as large as the way to the nearest cell
-//! that is not the mesh's allows, and the overhang beside that. Of these the one that holds the most boxes is taken, until all are held (greedy set
-//! cover). So thick parts get large spheres and everything of the mesh is in a sphere by construction, its inside too where it is closed. The overhang
-//! is a share of the mesh's length, and grows where that takes too many spheres.
+//! The mesh is rasterised to a fine grid: its cells are those that the surface passes through and those that it encloses. The cells are grouped in
+//! blocks, and of each block the bounding box of its mesh cells has to be covered. The candidates are spheres about the centre of each box, with a
+//! radius of the distance to the nearest cell outside of the mesh, plus the overhang. The candidate that covers the most boxes is chosen repeatedly,
+//! until all are covered (greedy set cover). So thick parts get large spheres, and all of the mesh is in a sphere by construction, its inside too if
+//! it is closed. The overhang is a share of the mesh's length, and grows if it takes too many spheres.
 
 use crate::spheres::Sphere;
 use crate::surface::cut;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap, VecDeque};
 
-/// Spheres of one mesh at the most.
+/// Maximum number of spheres of one mesh.
 const MAX_SPHERES: usize = 96;
 
-/// How far a sphere may stand out of the cells, as a part of the mesh's longest side, at first; and how much more each time it is too little.
+/// How far a sphere may stand out of the cells, as a share of the mesh's longest side, at first; and the growth factor if that needs too many spheres.
 const OVERHANG: f64 = 0.025;
 const MORE: f64 = 1.4;
 
-/// Blocks along the longest side at the most, how many of them there are at the most, and cells along the edge of one.
+/// Maximum number of blocks along the longest side, maximum number of blocks, and cells along the edge of a block.
 const FINEST: usize = 32;
 const MOST_BLOCKS: usize = 1_500;
 const CELLS: usize = 3;
 
-/// Cells that the triangles are looked for in: a mesh of many that are all as large as itself is put into a coarser grid.
+/// Maximum number of cells that are tested for triangles: a mesh of many triangles that are as large as itself gets a coarser grid.
 const MOST_LOOKS: usize = 5_000_000;
 
-/// Surfaces that lie between two cells belong to both, in cells.
+/// Surfaces on the border of two cells belong to both, in cells.
 const SKIN: f64 = 1e-6;
 
-/// Spheres that hold triangles.
+/// Spheres that contain the triangles.
 pub(crate) fn cover(triangles: &[[[f64; 3]; 3]]) -> Vec<Sphere> {
     let mut blocks = FINEST;
     while blocks > 1 && looks(triangles, CELLS * blocks) > MOST_LOOKS {
@@ -55,7 +55,7 @@ pub(crate) fn cover(triangles: &[[[f64; 3]; 3]]) -> Vec<Sphere> {
     }
 }
 
-/// In how many cells triangles may be, of a grid with so many along the longest edge.
+/// The number of cells in the bounding boxes of all triangles, in a grid with `longest` cells along the longest edge.
 fn looks(triangles: &[[[f64; 3]; 3]], longest: usize) -> usize {
     let between = |corners: &mut dyn Iterator<Item = f64>| {
         let (least, greatest) = corners.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), c| (a.min(c), b.max(c)));
@@ -69,7 +69,7 @@ fn looks(triangles: &[[[f64; 3]; 3]], longest: usize) -> usize {
     triangles.iter().map(of).sum()
 }
 
-/// Few of the spheres about the middles of boxes, each so much larger than it is deep, that hold all boxes.
+/// A small set of spheres about the centres of boxes that covers all boxes; each is larger than the depth of its centre by the overhang.
 fn held(boxes: &[Cuboid], deep: &[f64], overhang: f64) -> Vec<Sphere> {
     let sphere = |(cuboid, deep): (&Cuboid, &f64)| Sphere {
         centre: cuboid.centre,
@@ -79,7 +79,7 @@ fn held(boxes: &[Cuboid], deep: &[f64], overhang: f64) -> Vec<Sphere> {
     let holds = |sphere: usize, cuboid: usize| boxes[cuboid].reach_from(all[sphere].centre) <= all[sphere].radius;
     let mut open: Vec<usize> = (0..boxes.len()).collect();
     let count = |sphere: usize, open: &[usize]| open.iter().filter(|cuboid| holds(sphere, **cuboid)).count();
-    // What a sphere holds of the boxes that are left gets less: the first whose count is still true holds the most. Of two the earlier one.
+    // The number of remaining boxes in a sphere only decreases: the first sphere whose count is still true has the most. Of two, the earlier one.
     let mut counts: BinaryHeap<(usize, Reverse<usize>)> =
         (0..all.len()).map(|i| (count(i, &open), Reverse(i))).collect();
     let mut taken = Vec::new();
@@ -95,27 +95,27 @@ fn held(boxes: &[Cuboid], deep: &[f64], overhang: f64) -> Vec<Sphere> {
         let centre = all[i].centre;
         let (own, left): (Vec<usize>, Vec<usize>) = open.into_iter().partition(|cuboid| holds(i, *cuboid));
         open = left;
-        // No larger than it has to be.
+        // No larger than necessary.
         let radius = own.iter().map(|cuboid| boxes[*cuboid].reach_from(centre)).fold(0.0, f64::max) * (1.0 + SKIN);
         taken.push(Sphere { centre, radius });
     }
     taken
 }
 
-/// A box along the axes.
+/// An axis-aligned box.
 struct Cuboid {
     centre: [f64; 3],
     half: [f64; 3],
 }
 
 impl Cuboid {
-    /// How far its farthest corner is from a point.
+    /// Distance of its farthest corner from a point.
     fn reach_from(&self, point: [f64; 3]) -> f64 {
         (0..3).map(|i| ((point[i] - self.centre[i]).abs() + self.half[i]).powi(2)).sum::<f64>().sqrt()
     }
 }
 
-/// Cells over the box that holds a mesh.
+/// Cells over the bounding box of a mesh.
 struct Grid {
     least: [f64; 3],
     cell: [f64; 3],
@@ -124,7 +124,7 @@ struct Grid {
 }
 
 impl Grid {
-    /// With so many cells along the longest edge.
+    /// A grid with `longest` cells along the longest edge.
     fn new(triangles: &[[[f64; 3]; 3]], longest: usize) -> Grid {
         let corners = || triangles.iter().flatten();
         let least: [f64; 3] = std::array::from_fn(|i| corners().map(|c| c[i]).fold(f64::INFINITY, f64::min));
@@ -146,7 +146,7 @@ impl Grid {
         (x * self.counts[1] + y) * self.counts[2] + z
     }
 
-    /// Marks the cells of a polygon, in cells, slab by slab along one axis after the other.
+    /// Marks the cells of a polygon, whose unit is cells, slab by slab along one axis after the other.
     fn take(&mut self, polygon: Vec<[f64; 3]>, axis: usize, at: [usize; 3]) {
         if polygon.is_empty() {
             return;
@@ -168,10 +168,10 @@ impl Grid {
         }
     }
 
-    /// Marks what the surface closes in: all that cannot be reached from outside.
+    /// Marks the enclosed cells: all that cannot be reached from outside.
     fn fill(&mut self) {
         let mut outside = vec![false; self.taken.len()];
-        // From the sides of the grid inwards, one layer after the other, so that few cells wait.
+        // From the sides of the grid inwards, layer by layer, so that the queue stays short.
         let mut open: VecDeque<[usize; 3]> = VecDeque::new();
         let mut reach = |at: [usize; 3], open: &mut VecDeque<[usize; 3]>| {
             let index = self.index(at);
@@ -201,7 +201,7 @@ impl Grid {
         self.taken = outside.into_iter().map(|outside| !outside).collect();
     }
 
-    /// How many blocks have cells of the mesh.
+    /// Number of blocks with mesh cells.
     fn blocks(&self) -> usize {
         let counts = self.counts.map(|count| count.div_ceil(CELLS));
         let mut is_its = vec![false; counts.iter().product()];
@@ -212,7 +212,7 @@ impl Grid {
         is_its.into_iter().filter(|is_its| *is_its).count()
     }
 
-    /// Of each block that has cells of the mesh, the box around those.
+    /// For each block with mesh cells, the box around them.
     fn boxes(&self) -> Vec<Cuboid> {
         let mut bounds: BTreeMap<[usize; 3], [[usize; 3]; 2]> = BTreeMap::new();
         for at in (0..self.taken.len()).filter(|index| self.taken[*index]).map(|index| self.place(index)) {
@@ -229,7 +229,7 @@ impl Grid {
         bounds.into_values().map(cuboid).collect()
     }
 
-    /// How far the middle of each box is from the nearest cell that is not the mesh's.
+    /// Distance of each box's centre from the nearest cell outside of the mesh.
     fn depths(&self, boxes: &[Cuboid]) -> Vec<f64> {
         let is_beside = |index: &usize| {
             let at = self.place(*index);

@@ -1,23 +1,22 @@
-//! Where the mesh files are that a URDF names: `package://NAME/rest` below a root of packages, `file:///path`, and paths from the
-//! folder of the URDF.
+//! Finds the mesh files that a URDF names: `package://NAME/rest` below a folder of packages, `file:///path`, and paths relative to the folder of the URDF.
 
 use crate::mesh::MeshError;
 use std::path::PathBuf;
 
-/// Longest file of a mesh, in bytes.
+/// Maximum size of a mesh file, in bytes.
 const MAX_FILE: usize = 64 << 20;
 
-/// Folders to look in.
+/// The folders in which files are looked for.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct MeshFiles {
     /// The folder of the URDF.
     pub beside: PathBuf,
-    /// Folders that hold packages, or are one.
+    /// Folders that contain packages, or are one.
     pub packages: Vec<PathBuf>,
 }
 
 impl MeshFiles {
-    /// The file that a URDF names so.
+    /// The path of a file that a URDF names.
     ///
     /// # Errors
     /// [`MeshError::Read`] says where it was looked for.
@@ -46,10 +45,10 @@ impl MeshFiles {
         })
     }
 
-    /// What is in the file that a URDF names so.
+    /// The content of a file that a URDF names.
     ///
     /// # Errors
-    /// [`MeshError::Read`] says what is in the way.
+    /// [`MeshError::Read`] gives the reason.
     pub fn read(&self, name: &str) -> Result<Vec<u8>, MeshError> {
         let path = self.path(name)?;
         ratn_regular_file::read(&path, MAX_FILE)

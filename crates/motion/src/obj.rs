@@ -1,17 +1,17 @@
-//! Reading Wavefront OBJ: vertices and faces; normals, textures and groups say nothing of the shape. Of materials the diffuse colour is read;
-//! what is wrong with one costs the colour alone.
+//! Reads Wavefront OBJ: vertices and faces; normals, textures and groups do not affect the shape. Of materials the diffuse colour is read; an error
+//! in a material only loses the colour.
 
 use crate::mesh::{Colour, MAX_TRIANGLES, MeshError, Part};
 use crate::polygon;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 
-/// Materials of a file at the most, and files of them that are read.
+/// Maximum number of materials of a file, and maximum number of material files.
 const MOST_MATERIALS: usize = 4_096;
 const MOST_LIBRARIES: usize = 16;
 
-/// The triangles of a file; a face of more corners is cut ([`polygon`]). `library` gives what is in a file of materials that it names, if anybody
-/// asks for colours.
+/// The triangles of a file; faces with more corners are cut ([`polygon`]). `library` returns the content of a material file that it names, if colours
+/// are wanted.
 pub(crate) fn parts(bytes: &[u8], library: &mut dyn FnMut(&str) -> Option<Vec<u8>>) -> Result<Vec<Part>, MeshError> {
     let text = std::str::from_utf8(bytes).map_err(|error| {
         let line = bytes[..error.valid_up_to()].iter().filter(|b| **b == b'\n').count() + 1;
@@ -81,7 +81,7 @@ fn colours(bytes: &[u8], materials: &mut BTreeMap<String, Colour>) {
     }
 }
 
-/// A line with those that it goes on with: after a backslash at its end.
+/// A line with its continuation lines: those after a backslash at its end.
 fn continued<'t>(line: &'t str, lines: &mut impl Iterator<Item = (usize, &'t str)>) -> Result<Cow<'t, str>, String> {
     // A comment ends with its line.
     if !line.ends_with('\\') || line.contains('#') {

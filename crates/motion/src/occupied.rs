@@ -1,10 +1,10 @@
-//! Clouds and meshes as the vector kernels want them: balls within the robot's reach.
+//! Prepares clouds and meshes for the vector kernels: balls within the robot's reach.
 //!
-//! What of a mesh is beyond the reach is cut off first, so all work is bounded by the reach and the resolution, however large the mesh is.
-//! The grid lies over what is left of it, and the surface, held by balls ([`surface`](crate::surface)), is marked in the whole grid. So the
-//! cells that it does not pass through are solid or free as a whole, and so is each part of them that hangs together. The others are cut
-//! into small cells, so narrow that a sphere with its centre in one either touches the surface or is on the same side of it as the middle
-//! of the small cell. Where the bounds do not allow such narrow ones, small cells that the surface passes through are solid.
+//! Parts of a mesh beyond the reach are cut off first, so all work is bounded by the reach and the resolution, whatever the size of the mesh. The
+//! grid covers the rest, and the surface, covered by balls ([`surface`](crate::surface)), is marked in the whole grid. So the cells that it does not
+//! pass through are solid or free as a whole, and so is each connected part of them. The others are divided into small cells, so narrow that a sphere
+//! with its centre in one either touches the surface or is on the same side of it as the centre of the small cell. If the bounds do not allow such
+//! narrow small cells, those that the surface passes through are solid.
 
 use crate::cloud::Cloud;
 use crate::inside::Inside;
@@ -14,31 +14,31 @@ use crate::surface::{self, Bounds};
 use crate::surroundings::MeshObstacle;
 use std::ops::RangeInclusive;
 
-/// The most by which a sphere may grow between two postures and still be judged exactly, in metres.
+/// Maximum growth of a sphere between two postures for which the test is exact, in metres.
 const GROWTH_M: f64 = 0.03;
 
-/// The narrowest small cells, in metres, and how many there are along a side of a cell at the most.
+/// Minimum width of small cells, in metres, and their maximum number along a side of a cell.
 const LEAST_SPACING_M: f64 = 0.004;
 const MOST_PER_SIDE: usize = 32;
 
-/// Small cells of one mesh at the most, and triangles that are looked at to fill them; both decide together with the reach how narrow they are.
+/// Maximum number of small cells of one mesh, and of triangle tests to fill them; with the reach, both determine the width of small cells.
 const MOST_SMALL_CELLS: usize = 1 << 29;
 const MOST_LOOKS: usize = 1 << 26;
 
-/// Meshes that may each take as much as one alone; where there are more, they share that.
+/// Number of meshes that may each use the full bounds; if there are more, they share them.
 const FULL_SHARES: usize = 8;
 
-/// By how much what one of so many meshes may take is divided.
+/// Divisor of the bounds for each of this number of meshes.
 pub(crate) fn share(meshes: usize) -> usize {
     meshes.div_ceil(FULL_SHARES).max(1)
 }
 
-/// A robot's spheres.
+/// The spheres of a robot.
 #[derive(Debug, Clone)]
 pub(crate) struct Reached {
-    /// Where they can be: centres and radii of spheres that hold them.
+    /// Where they can be: centres and radii of spheres that contain them.
     pub(crate) shells: Vec<([f64; 3], f64)>,
-    /// The least and the greatest radius.
+    /// The minimum and maximum radius.
     pub(crate) radii: [f64; 2],
 }
 
@@ -50,14 +50,14 @@ impl Reached {
         })
     }
 
-    /// A box that holds all shells.
+    /// A box that contains all shells.
     fn bounds(&self) -> Bounds {
         let corners = |(anchor, reach): &([f64; 3], f64)| [-reach, *reach].map(|by| anchor.map(|c| c + by));
         Bounds::about(self.shells.iter().flat_map(corners))
     }
 }
 
-/// The balls of some clouds of one radius that the robot reaches; `None` without any.
+/// The balls of clouds with the same radius that the robot reaches; `None` without any.
 pub(crate) fn cloud(clouds: &[&Cloud], robot: &Reached, isa: Isa) -> Option<simd::Cloud> {
     let radius = clouds.first()?.radius_m();
     let reached = |p: &&[f32; 3]| robot.reaches(&p.map(f64::from), radius);
@@ -72,7 +72,7 @@ pub(crate) fn cloud(clouds: &[&Cloud], robot: &Reached, isa: Isa) -> Option<simd
     Some(simd::Cloud::new(&points, radius as f32, layout, reach, isa))
 }
 
-/// A mesh, where the robot reaches it; `None` where it does not. It takes one `share`-th of what it may at the most.
+/// A mesh within the robot's reach; `None` if there is nothing. It may use a `share`-th of the bounds.
 pub(crate) fn mesh(obstacle: &MeshObstacle, robot: &Reached, isa: Isa, share: usize) -> Option<simd::Cloud> {
     let in_world = |triangle: &[[f64; 3]; 3]| triangle.map(|corner| obstacle.pose.transform(corner));
     let triangles: Vec<[[f64; 3]; 3]> = obstacle.mesh.triangles().iter().map(in_world).collect();
@@ -116,7 +116,7 @@ fn bounds(layout: &Layout) -> Bounds {
     Bounds { least: layout.least.map(f64::from), greatest: layout.greatest.map(f64::from) }
 }
 
-/// What is inside in the cells that the surface passes through, in the order of their numbers; balls of a radius about `points` hold the surface.
+/// The inside of the mesh in the cells that the surface passes through, ordered by number; balls of a radius about `points` cover the surface.
 fn filling(
     inside: &Inside,
     layout: &Layout,
@@ -137,13 +137,13 @@ fn filling(
         };
         [along(0, x), along(1, y)]
     };
-    // A few places of each column tell what it costs.
+    // A few places of each column give an estimate of its cost.
     let loads = columns.iter().map(|column| {
         let places = [[0, 0], [0, 3], [1, 1], [2, 2], [3, 0], [3, 3]].map(|small| middle(column, small, 4));
         places.iter().map(|[x, y]| 1 + inside.load(*x, *y)).max().unwrap_or(1)
     });
     let load: usize = loads.sum();
-    // Where small cells are too wide, every ball is marked in them.
+    // If small cells are too wide, every ball is marked in them.
     let is_too_wide = |per_side: usize| cell / per_side as f64 > wanted;
     let marked = |per_side: usize| {
         let across = (2.0 * radius * per_side as f64 / cell + 2.0) as usize;
@@ -163,7 +163,7 @@ fn filling(
         for small_xy in (0..per_side).flat_map(|x| (0..per_side).map(move |y| [x, y])) {
             let [x, y] = middle(column, small_xy, per_side);
             for [from, to] in inside.column(x, y) {
-                // Those whose middle is inside.
+                // The cells whose centre is inside.
                 let (first, end) =
                     ((small(2, from) - 0.5).ceil().max(0.0) as usize, (small(2, to) + 0.5).floor() as usize);
                 for &index in column {
@@ -196,7 +196,7 @@ fn filling(
     filling
 }
 
-/// What of `first..end` is in the `count` numbers from `base` on, counted from there.
+/// The part of `first..end` in the `count` numbers from `base` on, relative to `base`.
 fn shared(first: usize, end: usize, base: usize, count: usize) -> Option<RangeInclusive<usize>> {
     let (from, to) = (first.max(base), end.min(base + count));
     (from < to).then(|| from - base..=to - base - 1)
@@ -213,7 +213,7 @@ impl Marks {
         Marks { layout, marked: vec![false; layout.cells()] }
     }
 
-    /// Marks the cells that a ball may meet.
+    /// Marks the cells that a ball may overlap.
     fn mark(&mut self, point: &[f32; 3], radius: f32) {
         let slot = |at: f32, i: usize| self.layout.slot(i, at);
         let from: [usize; 3] = std::array::from_fn(|i| slot(point[i] - radius * 1.01, i));
@@ -228,19 +228,19 @@ impl Marks {
         }
     }
 
-    /// Where these are marked.
+    /// A grid in which these cells are marked.
     fn of(layout: Layout, cells: &[usize]) -> Marks {
         let mut marks = Marks::new(layout);
         cells.iter().for_each(|cell| marks.marked[*cell] = true);
         marks
     }
 
-    /// The cells that are marked, in the order of their numbers.
+    /// The marked cells, ordered by number.
     fn cells(&self) -> impl Iterator<Item = usize> {
         self.marked.iter().enumerate().filter(|(_, marked)| **marked).map(|(cell, _)| cell)
     }
 
-    /// The cells that are not marked, by parts that hang together by sides.
+    /// The unmarked cells, grouped by parts that are connected by sides.
     fn free_parts(&self) -> Vec<Vec<usize>> {
         let mut seen = self.marked.clone();
         let mut parts = Vec::new();

@@ -1,8 +1,8 @@
-//! How the caller controls the planner: a callback is called often, reports progress, and answers whether to go on.
+//! How the caller controls the planner: it calls a callback often, which gets the progress and answers whether to continue.
 
 use crate::plan::Plan;
 
-/// What the planner reports when it asks whether to go on.
+/// What the planner reports when it calls the callback.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Progress<'p> {
     /// Nothing new.
@@ -12,17 +12,17 @@ pub enum Progress<'p> {
         /// Its length in joint space.
         length_rad: f64,
     },
-    /// The path became quicker; of the first one, when its improvement begins.
+    /// The path became quicker; for the first one, when its improvement begins.
     Quicker {
-        /// About how long what follows the departure takes now, in seconds.
+        /// Estimated duration of the motion after the departure, in seconds.
         about_s: f64,
     },
-    /// A whole motion that can be used, after [`Control::Settle`]: the best so far, then those that are at least [`BETTER`] quicker. They all
-    /// end in the same posture.
+    /// A complete, usable motion, after [`Control::Settle`]: the best so far, then those that are at least [`BETTER`] quicker. They all end in the
+    /// same posture.
     Usable(&'p Plan),
 }
 
-/// A motion that is usable already is reported again when this share of its duration is saved.
+/// A quicker motion is reported when it saves at least this share of the duration.
 pub const BETTER: f64 = 0.01;
 
 /// The caller's answer.
@@ -30,7 +30,7 @@ pub const BETTER: f64 = 0.01;
 pub enum Control {
     /// Go on.
     Continue,
-    /// The best so far will do: report it as [`Progress::Usable`] and go on, with the same end. Once said, it stays so.
+    /// The best motion so far is sufficient: report it as [`Progress::Usable`] and continue, with the same end. This answer remains in force.
     Settle,
     /// Finish with the best path so far.
     TimeUp,
@@ -65,7 +65,7 @@ pub(crate) struct Pace<'c> {
     control: &'c mut dyn FnMut(Progress<'_>) -> Control,
     /// Iterations of search and improvement so far.
     pub(crate) iterations: usize,
-    /// What is there will do.
+    /// The caller has answered [`Control::Settle`].
     is_settled: bool,
 }
 
@@ -96,7 +96,7 @@ impl<'c> Pace<'c> {
         answer
     }
 
-    /// Whether the caller has said that what is there will do.
+    /// Whether the caller has answered [`Control::Settle`].
     pub(crate) fn is_settled(&self) -> bool {
         self.is_settled
     }

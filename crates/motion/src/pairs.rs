@@ -1,17 +1,18 @@
-//! Pairs of links told apart by how they meet: as neighbours, in every posture, in the default state, now and then, or never as far as seen.
+//! Classifies pairs of links by how they collide: as neighbours, in every posture, in the default state, in some postures, or in none of the samples.
 //!
-//! A robot without an SRDF says nothing of the links that it is made to have in touch. So postures are drawn from all of its joints, always the
-//! same, and looked at by the exact shapes. What follows from that is careful: a pair that was not seen to meet stays checked, because samples
-//! prove nothing; so does one that meets in the default state and can part, because it can meet elsewhere, too. Only two kinds are not checked:
+//! A robot without an SRDF does not say which of its links are built to touch (the allowed collision matrix). So postures of all its joints are
+//! sampled, always the same ones, and checked by the exact shapes. The conclusions are conservative: a pair that was never in collision is still
+//! checked, because samples prove nothing; so is a pair that collides in the default state and can separate, because it can collide elsewhere, too.
+//! Only two kinds are not checked:
 //!
-//! - neighbours whose spheres meet in the default state: they are made to touch at the joint between them, and its limits keep them from more;
-//! - pairs that meet in every posture: nothing is there to be kept apart, and a check would forbid all postures. These are not checked beside an SRDF
-//!   either; one that excepts no pair at all is taken for none.
+//! - neighbours whose spheres overlap in the default state: they are built to touch at their joint, whose limits prevent more;
+//! - pairs that collide in every posture: they cannot be kept apart, and a check would forbid all postures. These are not checked beside an SRDF
+//!   either; an SRDF without any exception counts as none.
 //!
-//! The search sees spheres. Where they meet so often though the shapes do not that it could not move, the exact check of the finished path alone
-//! sees the pair ([`Checks::by_shapes`]). With an SRDF that is so where the spheres leave hardly a posture of those in which the shapes are apart:
-//! they would forbid nearly all that the SRDF leaves to be planned. The robots of workers and cells, which know meshes by spheres that hold them,
-//! take that for links with meshes without an SRDF, too (`RobotModel::read_with_covers`).
+//! The search uses spheres. If those of a pair overlap so often, although the shapes do not, that the robot could not move, only the exact check of
+//! the finished path checks the pair ([`Checks::by_shapes`]). With an SRDF this is so if the spheres overlap in nearly all postures in which the
+//! shapes are apart: they would forbid nearly all motions that the SRDF allows. The robots of workers and cells, whose meshes are represented by
+//! enclosing spheres, use this rule for links with meshes without an SRDF, too (`RobotModel::read_with_covers`).
 
 use crate::diagnosis;
 use crate::exact::Exact;
@@ -28,33 +29,33 @@ use std::fmt;
 /// Two links, the lower index first.
 pub type Pair = (usize, usize);
 
-/// Postures that every pair is looked at in, and those that have met in all of them.
+/// Number of postures in which every pair is checked, and number for pairs that collide in all of those.
 const SAMPLES: usize = 64;
 const MORE_SAMPLES: usize = 1_000;
 
-/// Spheres that meet in this part of the postures though the shapes do not say nothing of a pair.
+/// If the spheres of a pair overlap although the shapes do not, in more than this share of the postures, the pair is checked by its shapes only.
 const MISTAKEN: f64 = 0.1;
 
-/// With an SRDF: in this part of the postures in which the shapes are apart.
+/// With an SRDF: the share of the postures in which the shapes are apart.
 const TAKEN: f64 = 0.9;
 
-/// Where both limits are infinite, positions are drawn from this far on both sides of zero, in radians or metres.
+/// If both limits are infinite, positions are sampled up to this far from zero, in radians or metres.
 const ENDLESS: f64 = std::f64::consts::PI;
 
 const SEED: u64 = 1;
 
-/// How two links meet.
+/// How two links collide.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
-    /// Neighbours whose spheres meet in the default state.
+    /// Neighbours whose spheres overlap in the default state.
     Neighbours,
     /// In every posture.
     Always,
-    /// In the default state, and not always.
+    /// In the default state, but not in every posture.
     ByDefault,
     /// In some postures.
     Sometimes,
-    /// In none that was looked at.
+    /// In none of the samples.
     Never,
 }
 
@@ -70,34 +71,34 @@ impl fmt::Display for Kind {
     }
 }
 
-/// What is checked of a robot's pairs of links.
+/// How a robot's pairs of links are checked for collisions.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Checks {
-    /// Not checked at all.
+    /// Pairs that are not checked.
     pub excepted: BTreeSet<Pair>,
-    /// Checked by the exact shapes, and not by spheres.
+    /// Pairs that are checked by their exact shapes, and not by spheres.
     pub by_shapes: BTreeSet<Pair>,
-    /// Of those that are not checked, those of which no SRDF says so: they meet in every posture, or are neighbours that are made to touch.
+    /// Unchecked pairs that no SRDF excepts: they collide in every posture, or are neighbours that are built to touch.
     pub unsaid: BTreeSet<Pair>,
 }
 
-/// What postures are looked at for.
+/// What the samples are needed for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Look {
     /// The kind of every pair.
     All,
-    /// What to check.
+    /// How to check the pairs.
     Checks,
-    /// Whether spheres leave anything of the postures in which the shapes are apart.
+    /// Whether the spheres are apart in any of the postures in which the shapes are.
     Undecided,
 }
 
-/// How often two links were seen, and seen to meet.
+/// Number of samples of a pair, and of its collisions.
 #[derive(Debug, Clone, Copy, Default)]
 struct Tally {
     postures: usize,
     met: usize,
-    /// By their spheres and not by their shapes.
+    /// Samples in which the spheres overlap, but not the shapes.
     mistaken: usize,
     met_by_default: bool,
     is_neighbour: bool,
@@ -115,7 +116,7 @@ impl Tally {
         }
     }
 
-    /// Whether one more posture tells something.
+    /// Whether another posture gives more information.
     fn is_open(&self, look: Look) -> bool {
         match look {
             Look::All => true,
@@ -124,13 +125,13 @@ impl Tally {
         }
     }
 
-    /// Whether the spheres meet in nearly all postures in which the shapes are apart.
+    /// Whether the spheres overlap in nearly all postures in which the shapes are apart.
     fn is_undecided(&self) -> bool {
         self.mistaken > 0 && self.mistaken as f64 >= TAKEN * (self.postures - self.met) as f64
     }
 }
 
-/// What to check of a robot whose SRDF says nothing.
+/// The checks of a robot without an SRDF.
 pub(crate) fn checks(model: &RobotModel) -> Checks {
     let mut checks = Checks::default();
     for (pair, tally) in tallies(model, Checks::default(), Look::Checks) {
@@ -144,7 +145,7 @@ pub(crate) fn checks(model: &RobotModel) -> Checks {
     checks
 }
 
-/// What to check where an SRDF excepts pairs: all others, but for those that meet in every posture.
+/// The checks of a robot whose SRDF excepts pairs: all others, except those that collide in every posture.
 pub(crate) fn beside_srdf(model: &RobotModel, excepted: BTreeSet<Pair>) -> Checks {
     let mut checks = Checks { excepted, ..Checks::default() };
     for (pair, tally) in tallies(model, checks.clone(), Look::Undecided) {
@@ -158,7 +159,7 @@ pub(crate) fn beside_srdf(model: &RobotModel, excepted: BTreeSet<Pair>) -> Check
     checks
 }
 
-/// The names of pairs, at the most so many of them.
+/// The names of at most `most` pairs, and the number of the others.
 pub fn named(model: &RobotModel, pairs: &mut dyn Iterator<Item = &Pair>, most: usize) -> String {
     let name = |(a, b): &Pair| format!("{} and {}", model.links[*a].name, model.links[*b].name);
     let mut names: Vec<String> = pairs.map(name).collect();
@@ -167,12 +168,12 @@ pub fn named(model: &RobotModel, pairs: &mut dyn Iterator<Item = &Pair>, most: u
     names.join(", ") + &if more > 0 { format!(" and {more} more") } else { String::new() }
 }
 
-/// What an SRDF says of a pair that is not to be checked.
+/// The SRDF line that excepts a pair from the checks.
 pub fn exception(model: &RobotModel, (a, b): Pair, reason: &str) -> String {
     diagnosis::exception(&model.links[a].name, &model.links[b].name, reason)
 }
 
-/// Pairs that are checked and meet in every posture of what is planned for: no planned joint parts them, so no posture is free.
+/// Checked pairs that collide in every posture of the planned joints: no planned joint separates them, so no posture is free.
 pub fn never_apart(mechanism: &Mechanism) -> Vec<Pair> {
     let exact = Exact::new(mechanism, &[]);
     let mut random = ChaCha8Rng::seed_from_u64(SEED);
@@ -187,14 +188,14 @@ pub fn never_apart(mechanism: &Mechanism) -> Vec<Pair> {
     pairs
 }
 
-/// Of the pairs that are checked, those whose spheres meet in nearly all postures in which their shapes are apart.
+/// The checked pairs whose spheres overlap in nearly all postures in which their shapes are apart.
 pub(crate) fn undecided(model: &RobotModel, excepted: &BTreeSet<Pair>) -> BTreeSet<Pair> {
     let checks = Checks { excepted: excepted.clone(), ..Checks::default() };
     let tallies = tallies(model, checks, Look::Undecided).into_iter();
     tallies.filter(|(_, tally)| tally.is_undecided()).map(|(pair, _)| pair).collect()
 }
 
-/// All pairs that some joint moves against each other, by kind, from a thousand postures.
+/// All pairs that some joint moves relative to each other, by kind, from a thousand postures.
 pub fn kinds(model: &RobotModel) -> BTreeMap<Kind, Vec<Pair>> {
     let mut kinds: BTreeMap<Kind, Vec<Pair>> = BTreeMap::new();
     for (pair, tally) in tallies(model, Checks::default(), Look::All) {
@@ -249,7 +250,7 @@ pub(crate) fn drawn(joint: &Joint, random: &mut impl Rng) -> f64 {
     if lower < upper { random.random_range(lower..=upper) } else { lower }
 }
 
-/// Of each link, a sphere that holds its spheres.
+/// For each link, a sphere that contains its spheres.
 pub(crate) fn around(mechanism: &Mechanism) -> Vec<Sphere> {
     let of = |spheres: &[Sphere]| {
         let count = spheres.len().max(1) as f64;

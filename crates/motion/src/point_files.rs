@@ -1,17 +1,17 @@
-//! Reading points from files: PCD and PLY, or three numbers per line (`.xyz`, `.csv`, `.txt`).
+//! Reads points from files: PCD and PLY, or three numbers per line (`.xyz`, `.csv`, `.txt`).
 //!
-//! A file that was cut off is refused where its format says how long it is. A list of lines does not: it is refused where its last line does
-//! not end and has fewer fields than the one before it. One that was cut within its last number, or between two lines, cannot be told from
-//! a whole one.
+//! A truncated file is refused if its format gives the length. A list of lines gives none: it is refused if its last line has no end and fewer fields
+//! than the line before. A file that was truncated within its last number, or between two lines, cannot be recognised
+//! as such.
 
 use crate::cloud::MAX_POINTS;
 use crate::{pcd, ply};
 use std::borrow::Cow;
 
-/// Why there are no points.
+/// Why no points were read.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PointsError {
-    /// Of another kind.
+    /// The file has another format.
     #[error("points are read from .xyz, .csv, .txt, .pcd or .ply; convert it")]
     Kind,
     /// A line that cannot be read.
@@ -22,7 +22,7 @@ pub enum PointsError {
         /// What is wrong.
         reason: String,
     },
-    /// Binary data that cannot be read.
+    /// Binary data cannot be read.
     #[error("at byte {offset}: {reason}")]
     Byte {
         /// Counted from 0.
@@ -32,7 +32,7 @@ pub enum PointsError {
     },
 }
 
-/// The points of a file, by the end of its name. What a camera did not see (`nan`, `inf`) is left out.
+/// The points of a file, whose format follows from the end of its name. Points that the camera did not see (`nan`, `inf`) are left out.
 ///
 /// # Errors
 /// [`PointsError`] names the line, or the byte.
@@ -45,11 +45,11 @@ pub fn points(name: &str, bytes: &[u8]) -> Result<Vec<[f32; 3]>, PointsError> {
         _ => return Err(PointsError::Kind),
     };
     let is_seen = |point: &&[f64; 3]| point.iter().all(|c| c.is_finite());
-    // What is too large for `f32` becomes infinite, which a cloud refuses.
+    // Values too large for `f32` become infinite, which a cloud refuses.
     Ok(points.iter().filter(is_seen).map(|point| point.map(|c| c as f32)).collect())
 }
 
-/// The points of a PCD or PLY file that has no name, by how it begins.
+/// The points of a PCD or PLY file without a name, by its first bytes.
 ///
 /// # Errors
 /// [`PointsError`] names the line, or the byte.
@@ -57,7 +57,7 @@ pub fn points_by_content(bytes: &[u8]) -> Result<Vec<[f32; 3]>, PointsError> {
     points(if bytes.starts_with(b"ply") { "it.ply" } else { "it.pcd" }, bytes)
 }
 
-/// Three numbers at the beginning of each line, between semicolons, commas or spaces, the first of these that is there.
+/// The three numbers at the beginning of each line, separated by semicolons, else by commas, else by spaces.
 fn columns(bytes: &[u8]) -> Result<Vec<[f64; 3]>, PointsError> {
     let (mut points, mut fields_before) = (Vec::new(), 0);
     let mut lines = Lines::new(bytes);
@@ -107,7 +107,7 @@ impl<'l> Iterator for Words<'l> {
     }
 }
 
-/// The lines of a file, counted from 1; after some of them it may be binary.
+/// The lines of a file, counted from 1; binary data may follow them.
 #[derive(Debug)]
 pub(crate) struct Lines<'b> {
     rest: &'b [u8],
@@ -119,12 +119,12 @@ impl<'b> Lines<'b> {
         Lines { rest: bytes, line: 0 }
     }
 
-    /// The number of the last line that was given.
+    /// The number of the last line.
     pub(crate) fn line(&self) -> usize {
         self.line
     }
 
-    /// What comes after it.
+    /// The bytes after the last line.
     pub(crate) fn rest(&self) -> &'b [u8] {
         self.rest
     }

@@ -1,21 +1,21 @@
-//! Cutting a flat polygon of a file into triangles.
+//! Triangulates a flat polygon of a file.
 //!
-//! A convex one is cut from its first corner. In others ears are cut off: corners whose triangle holds no other corner (Meisters, *Polygons
-//! have ears*, American Mathematical Monthly 1975). All edges of the outline are edges of triangles in their direction, also where the polygon
-//! crosses itself, so that what is closed stays closed.
+//! A convex polygon is cut from its first corner. From others ears are cut off: corners whose triangle contains no other corner (Meisters, *Polygons
+//! have ears*, American Mathematical Monthly 1975). All edges of the outline are edges of triangles, in their direction, even if the polygon
+//! intersects itself, so that a closed mesh stays closed.
 
 type Corner = [f64; 3];
 
-/// Corners of a polygon that is not convex at the most: the work grows with their square.
+/// Maximum number of corners of a polygon that is not convex: the work grows with its square.
 pub(crate) const MOST_CORNERS: usize = 1_000;
 
-/// What the area of three corners may be short of zero, relative to the polygon's, and still count as flat.
+/// Tolerance for a negative area of three corners that counts as flat, relative to the polygon's area.
 const FLAT: f64 = 1e-9;
 
 /// The triangles of a polygon of three corners or more.
 ///
 /// # Errors
-/// A polygon that is not convex and has more than [`MOST_CORNERS`] corners, in words.
+/// The error message for a polygon that is not convex and has more than [`MOST_CORNERS`] corners.
 pub(crate) fn triangles(corners: &[Corner]) -> Result<Vec<[Corner; 3]>, String> {
     let fan = || (1..corners.len().saturating_sub(1)).map(|i| [corners[0], corners[i], corners[i + 1]]).collect();
     if corners.len() < 4 {
@@ -37,7 +37,7 @@ pub(crate) fn triangles(corners: &[Corner]) -> Result<Vec<[Corner; 3]>, String> 
     Ok(ears(&flat).into_iter().map(|ear| ear.map(|i| corners[i])).collect())
 }
 
-/// In the plane of two axes in which the polygon is largest, walked to the left.
+/// The polygon projected to the plane of two axes in which its area is largest, counterclockwise.
 fn flattened(corners: &[Corner]) -> Vec<[f64; 2]> {
     let first = corners[0];
     let at = |i: usize| -> Corner { std::array::from_fn(|axis| corners[i % corners.len()][axis] - first[axis]) };
@@ -57,12 +57,12 @@ fn flattened(corners: &[Corner]) -> Vec<[f64; 2]> {
     (0..corners.len()).map(|i| [at(i)[u], at(i)[v]]).collect()
 }
 
-/// Twice the area, negative where it is walked to the right.
+/// Twice the area, negative if clockwise.
 fn area(flat: &[[f64; 2]]) -> f64 {
     (0..flat.len()).map(|i| (flat[i], flat[(i + 1) % flat.len()])).map(|(a, b)| a[0] * b[1] - b[0] * a[1]).sum()
 }
 
-/// Twice the area of three corners, negative where they turn to the right.
+/// Twice the area of three corners, negative if they turn clockwise.
 fn turn(a: [f64; 2], b: [f64; 2], c: [f64; 2]) -> f64 {
     (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
 }
@@ -73,12 +73,12 @@ fn ears(flat: &[[f64; 2]]) -> Vec<[usize; 3]> {
     let mut ears = Vec::with_capacity(flat.len() - 2);
     while left.len() > 3 {
         let bends = |i: &usize| turns(flat, &left, *i) > 0.0;
-        // One that crosses itself, or has no area, may have no ear: any corner serves.
+        // A polygon that intersects itself, or has no area, may have no ear: then any corner is cut off.
         let next = is_ear.iter().position(|is| *is).or_else(|| (0..left.len()).find(bends)).unwrap_or(0);
         ears.push(around(&left, next));
         left.remove(next);
         is_ear.remove(next);
-        // Of the others only the two beside it have changed.
+        // Only the two neighbours have changed.
         for beside in [(next + left.len() - 1) % left.len(), next % left.len()] {
             is_ear[beside] = ear(flat, &left, beside);
         }

@@ -1,13 +1,13 @@
 //! Planning problems from a file: a robot's joints and, by class, scenes with a start and a goal.
 //!
-//! The format is JSON: `robot`, `joints` (names, the order of all positions) and `problems`, per class a list of `index`, `start`,
-//! `goal` (radians, metres for sliding joints) and `objects` (`name`, `position` in metres, `quat_xyzw`, and by `type` a `box`
-//! with `size`, a `cylinder` or `capsule` with `length` and `radius`, a `sphere` with `radius`; a capsule's `length` is between
-//! the centres of its ends). `attached` counts what the robot holds, which must be nothing. `state` says where joints are that are not
-//! planned for, by name: of the file for all problems, of a problem for that one. The others are at zero, or at the limit next to it.
+//! The format is JSON: `robot`, `joints` (names, the order of all positions) and `problems`, per class a list of `index`, `start`, `goal` (radians,
+//! metres for prismatic joints) and `objects` (`name`, `position` in metres, `quat_xyzw`, and by `type` a `box` with `size`, a `cylinder` or
+//! `capsule` with `length` and `radius`, a `sphere` with `radius`; a capsule's `length` is between the centres of its ends). `attached` is the number
+//! of objects that the robot holds, which must be zero. `state` has the positions of joints that are not planned, by name: of the file for all
+//! problems, of a problem for that one. The others are at zero, or at the limit next to it.
 //!
-//! Clouds (`cloud`), meshes (`mesh`) and heights (`heightfield`) are in files of their own, which the caller reads; the points of a small
-//! cloud may stand in the problem itself.
+//! Clouds (`cloud`), meshes (`mesh`) and heights (`heightfield`) are in separate files, which the caller reads; the points of a small cloud may be in
+//! the problem itself.
 
 use crate::cloud::{self, Cloud};
 use crate::geometry::Geometry;
@@ -22,12 +22,12 @@ use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Points of all clouds of a file, and triangles of all its meshes and heightfields, at the most: a file may name a large one often. As many
-/// triangles has one problem, with each mesh as often as it stands there.
+/// Maximum number of points of all clouds of a file, and of triangles of all its meshes and heightfields: a file may use a large one many times. One
+/// problem has at most as many triangles, with each mesh counted for every use.
 const MOST_POINTS: usize = 4 * cloud::MAX_POINTS;
 const MOST_TRIANGLES: usize = 4 * mesh::MAX_TRIANGLES;
 
-/// The greatest distance from the robot that a `self_filter` leaves out, in metres.
+/// The maximum distance from the robot within which a `self_filter` removes points, in metres.
 const MOST_SELF_FILTER_M: f64 = 1.0;
 
 /// All problems of a file.
@@ -35,9 +35,9 @@ const MOST_SELF_FILTER_M: f64 = 1.0;
 pub struct Problems {
     /// The robot's name.
     pub robot: String,
-    /// What is planned for.
+    /// The planned joints.
     pub joints: Vec<String>,
-    /// By class, in the order of the alphabet.
+    /// By class, in alphabetical order.
     pub classes: BTreeMap<String, Vec<Problem>>,
 }
 
@@ -46,24 +46,24 @@ pub struct Problems {
 pub struct Problem {
     /// Its number in its class.
     pub index: u64,
-    /// What stands around: primitive shapes.
+    /// Obstacles: primitive shapes.
     pub obstacles: Vec<Obstacle>,
-    /// Points.
+    /// Obstacles: point clouds.
     pub clouds: Vec<Cloud>,
-    /// Which of the clouds, by number, show the robot itself at the start, and how far from it what they show is left out, in metres.
+    /// Clouds, by index, that show the robot itself at the start, and the distance from the robot within which their points are removed, in metres.
     pub self_filters: Vec<(usize, f64)>,
-    /// Meshes, and what heightfields are as such.
+    /// Obstacles: meshes, including those of heightfields.
     pub meshes: Vec<MeshObstacle>,
     /// Joint positions.
     pub start: Vec<f64>,
     /// Joint positions.
     pub goal: Vec<f64>,
-    /// Positions of joints that are not planned for.
+    /// Positions of joints that are not planned.
     pub state: BTreeMap<String, f64>,
 }
 
 impl Problem {
-    /// Leaves out of clouds what they show of the robot itself at the start.
+    /// Removes points of the robot itself at the start from the clouds.
     pub fn filter(&mut self, mechanism: &Mechanism) {
         for (cloud, margin_m) in std::mem::take(&mut self.self_filters) {
             if let Ok(others) = self.clouds[cloud].without_robot(mechanism, &self.start, margin_m) {
@@ -72,13 +72,13 @@ impl Problem {
         }
     }
 
-    /// All that stands around.
+    /// All obstacles.
     pub fn surroundings(&self) -> Surroundings<'_> {
         Surroundings { obstacles: &self.obstacles, clouds: &self.clouds, meshes: &self.meshes }
     }
 }
 
-/// A file that holds no problems.
+/// Why a file contains no valid problems.
 #[derive(Debug, thiserror::Error)]
 pub enum ProblemError {
     /// Not JSON of this form.
@@ -87,7 +87,7 @@ pub enum ProblemError {
     /// No problem at all.
     #[error("it holds no problems: `problems` is a list of problems for each class")]
     None,
-    /// Nothing is planned for.
+    /// No joint is planned.
     #[error("`joints` is empty: name the joints that are planned for, in the order of the postures' positions")]
     NoJoints,
     /// A joint that is named twice.
@@ -96,32 +96,31 @@ pub enum ProblemError {
         /// Its name.
         joint: String,
     },
-    /// A value that cannot be.
+    /// A value is invalid.
     #[error("problem {index} of class `{class}`: {reason}")]
     Value {
         /// Its class.
         class: String,
         /// Its number.
         index: u64,
-        /// What is wrong with it.
+        /// The error.
         reason: String,
     },
 }
 
 impl Problems {
-    /// Reads the text of a file that names no others.
+    /// Reads the text of a file that refers to no other files.
     ///
     /// # Errors
-    /// [`ProblemError`] names the line, or the problem and what is wrong with it.
+    /// [`ProblemError`] gives the line, or the problem and its error.
     pub fn parse(text: &str) -> Result<Problems, ProblemError> {
         Problems::parse_with_files(text, &mut |_| Err("no folder to look in was named".to_owned()))
     }
 
-    /// Reads the text of a file; `load` gives what is in a file that it names, or why it cannot be read. A file is loaded once, however
-    /// often it is named.
+    /// Reads the text of a file; `load` returns the content of a file that it refers to, or why it cannot be read. Each file is loaded once.
     ///
     /// # Errors
-    /// [`ProblemError`] names the line, or the problem, the object, its file and what is wrong with it.
+    /// [`ProblemError`] gives the line, or the problem, the object, its file and the error.
     pub fn parse_with_files(
         text: &str,
         load: &mut dyn FnMut(&str) -> Result<Vec<u8>, String>,
@@ -201,7 +200,7 @@ enum Shape {
     Heightfield(HeightsEntry),
 }
 
-/// Points in the file itself or in one of their own.
+/// Points in the file itself or in a separate one.
 #[derive(Deserialize)]
 struct PointsEntry {
     file: Option<String>,
@@ -239,13 +238,13 @@ fn upright() -> [f64; 4] {
     [0.0, 0.0, 0.0, 1.0]
 }
 
-/// What objects name, each file once.
+/// The files that objects refer to; each is loaded once.
 struct Files<'l> {
     load: &'l mut dyn FnMut(&str) -> Result<Vec<u8>, String>,
     loaded: BTreeMap<String, Arc<Vec<u8>>>,
-    /// By file, and what is made of it.
+    /// By file name and parameters.
     meshes: BTreeMap<(String, String), Arc<Mesh>>,
-    /// How many all clouds and all meshes have.
+    /// Number of points of all clouds, and of triangles of all meshes.
     points: usize,
     triangles: usize,
 }
@@ -260,7 +259,7 @@ impl Files<'_> {
         Ok(bytes)
     }
 
-    /// The mesh that `make` makes of a file; `how` tells apart what is made of the same file.
+    /// The mesh that `make` creates from a file; `how` distinguishes different meshes from the same file.
     fn mesh(
         &mut self,
         name: &str,
@@ -332,7 +331,7 @@ impl Entry {
 }
 
 impl Object {
-    /// Adds itself to what stands around.
+    /// Adds the object to the obstacles.
     fn read(self, problem: &mut Problem, files: &mut Files<'_>) -> Result<(), String> {
         let name = self.name;
         let improper = format!("object `{name}` has no proper size, place or rotation");

@@ -14,57 +14,57 @@ use ratn_model::pose::Pose;
 use ratn_world::scene::Scene;
 use std::f64::consts::FRAC_PI_2;
 
-/// The most boxes to keep out of.
+/// Maximum number of boxes to keep out of.
 const MAX_KEPT_OUT: usize = 64;
 
-/// The most alternatives of one goal.
+/// Maximum number of alternative goals.
 pub const MAX_GOALS: usize = 64;
 
-/// The slowest motion, as a fraction of the limits: a trajectory's points are as many as its time is long.
+/// The slowest motion, as a fraction of the limits: the number of a trajectory's points grows with its duration.
 pub const MIN_SPEED: f64 = 0.01;
 
-/// How far from the origin the base of a robot without one may be said to be, in metres and radians: rounding.
+/// Tolerance for the base pose of a robot without a base, relative to the origin, in metres and radians: rounding.
 const STANDS_STILL: f64 = 1e-6;
 
-/// A motion that is to be planned.
+/// A motion to plan.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Request {
-    /// The start: the positions of all parts of the robot. The arm moves from there; head and fingers stay as they are. The base is where the
-    /// scene has it, whatever this says. [`assumed`](crate::arm::assumed) fills in parts that are not known.
+    /// The start: the positions of all parts of the robot. The arm moves from there; head and fingers do not move. The base pose is that of the
+    /// scene, whatever this says. [`assumed`](crate::arm::assumed) fills in unknown parts.
     pub start: Configuration,
-    /// The goals, of which the motion may end at any one.
+    /// The goals; the motion ends at any one of them.
     pub goals: Vec<Goal>,
     /// The straight line of the tool with which the motion begins.
     pub depart: Straight,
     /// The straight line of the tool with which the motion ends.
     pub approach: Straight,
-    /// Go in straight lines of the tool from the end of the departure to the beginning of the approach, instead of along a free path.
+    /// Move in straight lines of the tool from the end of the departure to the beginning of the approach, instead of along a free path.
     pub straight: Option<WayPoints>,
-    /// Keeps the tool upright: the direction that points up in the tool at the end of the departure stays within this angle of up along the
+    /// Keeps the tool upright: the direction that points up in the tool at the end of the departure stays within this angle of the vertical along the
     /// free path, in radians.
     pub upright_rad: Option<f64>,
     /// Further constraints on the tool, for the whole motion.
     pub keep: Keep,
-    /// Boxes into which nothing comes that moves: no link, no finger, nothing that is held; not on the straight parts either, where fingers and
-    /// what they hold may touch things. Nothing stands there, so they hide nothing that a camera saw.
+    /// Boxes that no moving part may enter: no link, no finger, no held object; not on the straight parts either, where fingers and held objects may
+    /// touch things. The boxes are not obstacles, so they hide nothing that a camera saw.
     pub keep_out: Vec<Region>,
-    /// Names, in the scene, of hollow objects that the fingers may reach into on the straight parts, although their shapes are filled.
+    /// Names, in the scene, of hollow objects with filled shapes into which the fingers may reach on the straight parts.
     pub reaches_into: Vec<String>,
-    /// What a depth camera saw beside the scene.
+    /// Obstacles that a depth camera saw in addition to the scene.
     pub seen: Option<Seen>,
     /// Fraction of the joints' velocity and acceleration limits, [`MIN_SPEED`] to 1.
     pub speed: f64,
-    /// Fractions of the joints' limits of velocity (beside `speed`), acceleration (beside `speed`) and jerk, joint by joint.
+    /// Fractions of the limits of velocity (in addition to `speed`), acceleration (in addition to `speed`) and jerk, for each joint.
     pub scales: [JointVector; 3],
     /// Limits of the tool's speed.
     pub tool_speed: ToolSpeed,
     /// The same seed, scene and iterations give the same plan.
     pub seed: u64,
-    /// Iterations of improvement after the first path and its shortcutting; time may be up before.
+    /// Iterations of improvement after the first path and its shortcutting, unless the time is up before.
     pub improvement_iterations: usize,
 }
 
-/// What messages call one of the boxes to keep out of.
+/// The name of a box to keep out of, in messages.
 pub(crate) fn kept_out(index: usize) -> String {
     format!("keep_out[{index}]")
 }
@@ -79,7 +79,7 @@ pub enum Goal {
 }
 
 impl Request {
-    /// A request for the quickest motion to one of the goals, without straight parts and without improvement.
+    /// A request for the fastest motion to one of the goals, without straight parts and without improvement.
     pub fn new(start: Configuration, goals: Vec<Goal>) -> Request {
         Request {
             start,
@@ -112,7 +112,7 @@ impl Request {
         robot.arm_joints().iter().enumerate().map(scaled).collect()
     }
 
-    /// Refuses what makes no sense before anything is planned.
+    /// Refuses invalid requests before planning.
     pub(crate) fn check(&self, robot: &Robot, scene: &Scene) -> Result<(), PlanError> {
         let malformed = |what: &str, value: String, expected: &str| {
             Err(PlanError::Malformed { what: what.to_owned(), value, expected: expected.to_owned() })
@@ -197,7 +197,7 @@ impl Request {
     }
 }
 
-/// A position that is beyond the limits of its joint.
+/// A position beyond the limits of its joint.
 pub(crate) struct Outside {
     pub(crate) joint: String,
     pub(crate) position: f64,
@@ -205,12 +205,12 @@ pub(crate) struct Outside {
     pub(crate) range: String,
 }
 
-/// What positions of a joint are given in.
+/// The unit of a joint's positions.
 pub(crate) fn unit(slides: bool) -> &'static str {
     if slides { "m" } else { "rad" }
 }
 
-/// The first joint of arm, head and fingers that is beyond its limits.
+/// The first joint of arm, head or fingers that is beyond its limits.
 pub(crate) fn outside_of_limits(robot: &Robot, at: &Configuration) -> Option<Outside> {
     let head = || outside(&[at.pan, at.tilt], robot.head_joints(), &[false; 2]);
     let fingers = || outside(&[at.finger], robot.finger().map_or(&[], std::slice::from_ref), &[true]);

@@ -1,8 +1,8 @@
-//! A robot with its parts: an arm, and where it has them a gripper, a base, a head and a camera.
+//! A robot with its parts: an arm and, if it has them, a gripper, a base, a head and a camera.
 //!
-//! Which joints and links those are is data ([`RobotDescription`]); the robots that we ship are read the same way. Positions are `f64`
-//! throughout; only shapes and the poses handed to parry3d are `f32`. A [`Configuration`] says by parts where all of them are.
-//! Planning moves the arm; the others are where a configuration has them, joints of no part at zero or at the limit next to it.
+//! The joints and links of these parts are defined by data ([`RobotDescription`]); the built-in robots are read the same way. Positions are `f64`;
+//! only shapes and the poses for parry3d are `f32`. A [`Configuration`] has the positions of all parts. Planning moves the arm; the other parts stay
+//! at a configuration's positions, joints of no part at zero or at the limit next to it.
 
 mod arms;
 mod fingers;
@@ -36,9 +36,9 @@ use ratn_model::pose::Pose;
 pub struct Robot {
     /// All links and joints.
     pub model: RobotModel,
-    /// The tool frame, by the index of its link.
+    /// The index of the link that is the tool frame.
     pub tool: usize,
-    /// The links that an arm joint moves, parents before children.
+    /// The links that the arm's joints move, parents before children.
     pub arm_links: Vec<usize>,
     /// For each arm joint the link that it moves.
     pub arm_joint_links: Vec<usize>,
@@ -48,24 +48,24 @@ pub struct Robot {
     base: Option<Part>,
     head: Option<Part>,
     finger: Option<Part>,
-    /// The camera's optical frame: z forward, x right, y down.
+    /// The index of the link that is the camera's optical frame: z forward, x right, y down.
     camera: Option<usize>,
     /// The link that carries the fingers, and a finger.
     gripper: Option<[usize; 2]>,
     /// The base's body.
     body: Option<usize>,
     postures: Vec<(String, JointVector)>,
-    /// Where all joints are before a configuration says otherwise.
+    /// Default positions of all joints.
     neutral: Vec<f64>,
 }
 
-/// Joints of a robot that belong together.
+/// A group of a robot's joints.
 #[derive(Debug, Clone)]
 struct Part {
-    /// Among the model's joints.
+    /// Indices of the model's joints.
     indices: Vec<usize>,
     joints: Vec<Joint>,
-    /// Whether each joint slides.
+    /// Whether each joint is prismatic.
     slides: Vec<bool>,
 }
 
@@ -82,30 +82,30 @@ pub struct Configuration {
     pub tilt: f64,
     /// The distance of each finger from the middle, in metres: half of the opening.
     pub finger: f64,
-    /// Where the other arms and their fingers are, of a robot that has several.
+    /// Positions of the other arms and their fingers, for a robot with several arms.
     pub others: OtherArms,
 }
 
-/// Why a description and a URDF make no robot.
+/// Why a description and a URDF do not define a robot.
 #[derive(Debug, thiserror::Error)]
 pub enum RobotFault {
-    /// URDF, SRDF or a mesh is faulty, or does not have a name that the description uses.
+    /// The URDF, the SRDF or a mesh is invalid, or lacks a name that the description uses.
     #[error(transparent)]
     Model(#[from] MechanismError),
     /// The arm has no joints, or too many.
     #[error("`arm.joints` has {count} joints: expected 1 to {MAX_JOINTS}")]
     ArmJoints {
-        /// How many.
+        /// Number of joints.
         count: usize,
     },
     /// A part names a link that the URDF does not have.
     #[error("`{key}`: the robot description has no link `{link}`; {help}")]
     NoLink {
-        /// Where the description names it.
+        /// The key in the description.
         key: &'static str,
-        /// The name.
+        /// The name of the link.
         link: String,
-        /// What it may be instead.
+        /// A suggestion.
         help: String,
     },
     /// A joint of the arm does not move the tool.
@@ -116,13 +116,13 @@ pub enum RobotFault {
         /// The tool.
         tool: String,
     },
-    /// Too many arms.
+    /// There are too many arms.
     #[error("{count} arms: at most {MAX_ARMS} are supported")]
     Arms {
-        /// How many there are.
+        /// Number of arms.
         count: usize,
     },
-    /// Two arms have one name.
+    /// Two arms have the same name.
     #[error("two arms are called `{arm}`")]
     ArmTwice {
         /// The name.
@@ -135,34 +135,34 @@ pub enum RobotFault {
     JointOfTwo {
         /// The joint.
         joint: String,
-        /// A part.
+        /// The first part.
         first: String,
-        /// Another part.
+        /// The other part.
         second: String,
     },
-    /// Joints of an arm in another order.
+    /// The joints of an arm are in the wrong order.
     #[error(
         "`arm.joints` goes from the foot to the tool: the joint `{joint}` is nearer to the foot than `{before}`, put it before that one"
     )]
     Order {
         /// The joint.
         joint: String,
-        /// The one that is named before it.
+        /// The joint before it in the description.
         before: String,
     },
-    /// A joint of a kind that its part cannot have.
+    /// A joint has a kind that its part cannot have.
     #[error("`{key}`: the joint `{joint}` {does}; expected {expected}")]
     Kind {
-        /// Where the description names it.
+        /// The key in the description.
         key: &'static str,
         /// The joint.
         joint: String,
-        /// How it moves its link, or one that mimics it.
+        /// The motion of its link, or of a link that mimics it.
         does: String,
-        /// How it should.
+        /// The expected motion.
         expected: &'static str,
     },
-    /// A finger that the gripper does not move.
+    /// The gripper's joint does not move the finger.
     #[error("`gripper.finger`: the joint `{joint}` does not move the link `{finger}`; name one that it does")]
     Finger {
         /// The gripper's joint.
@@ -170,25 +170,25 @@ pub enum RobotFault {
         /// The finger.
         finger: String,
     },
-    /// A base that is not where its joints say.
+    /// The base is not at the pose that its joints give.
     #[error(
         "`base.joints`: at x = 1, y = 2 and heading 0.5 the link `{link}` is at {at:?} or turned; the base's joints begin at the root of \
          the URDF, without an offset before or between them: put an offset behind the last one"
     )]
     BaseOff {
-        /// The link that the heading turns.
+        /// The link that the heading rotates.
         link: String,
-        /// Where it is.
+        /// Its position.
         at: [f64; 3],
     },
-    /// An area in which the base cannot be.
+    /// The base cannot be in its area.
     #[error("`base.area`: {area:?} has nothing in common with the limits {limits:?} of the joint `{joint}`")]
     Area {
         /// The joint.
         joint: String,
-        /// What the description says, in metres.
+        /// The interval of the description, in metres.
         area: [f64; 2],
-        /// What the URDF says.
+        /// The limits of the URDF.
         limits: [f64; 2],
     },
     /// The robot has no arm of this name.
@@ -206,19 +206,19 @@ pub enum RobotFault {
     Posture {
         /// Its name.
         posture: String,
-        /// What is wrong with it.
+        /// The error.
         reason: String,
     },
     /// The workplace does not suit the robot.
     #[error("[workplace]: {reason}")]
     Workplace {
-        /// What is wrong with it.
+        /// The error.
         reason: String,
     },
 }
 
 impl RobotFault {
-    /// The link or joint of the description that does not fit.
+    /// The link or joint of the description that the error is about.
     pub(crate) fn named(&self) -> Option<&str> {
         match self {
             RobotFault::Model(MechanismError::Robot(
@@ -236,7 +236,7 @@ impl RobotFault {
     }
 }
 
-/// The robots that we ship: name, description, URDF and SRDF.
+/// The built-in robots: name, description, URDF and SRDF.
 const BUILT_IN: [(&str, &str, &str, &str); 4] = [
     (
         "aimm",
@@ -260,12 +260,12 @@ const BUILT_IN: [(&str, &str, &str, &str); 4] = [
 ];
 
 impl Configuration {
-    /// The base taken from a pose on the floor: its x, y and yaw.
+    /// The same with the base at the x, y and yaw of a pose on the floor.
     pub fn with_base(self, base: &Pose) -> Configuration {
         Configuration { base: on_floor(base), ..self }
     }
 
-    /// All positions: of the base, the arm, pan, tilt and finger; then of each other arm whose position is said its joints and its finger.
+    /// All positions: base, arm, pan, tilt and finger; then the joints and the finger of each other arm with a position.
     pub fn values(&self) -> Vec<f64> {
         let mut values = [&self.base[..], &self.arm[..], &[self.pan, self.tilt, self.finger]].concat();
         for other in self.others.iter().flatten() {
@@ -283,23 +283,23 @@ impl Robot {
         Robot::built_in("aimm").expect("it is built in")
     }
 
-    /// The names of the robots that we ship.
+    /// The names of the built-in robots.
     pub fn built_in_names() -> impl Iterator<Item = &'static str> {
         BUILT_IN.into_iter().map(|(name, ..)| name)
     }
 
-    /// What the `robot.toml` says of the robot of this name that we ship; its URDF is not read.
+    /// The description of the built-in robot of this name; its URDF is not read.
     pub fn built_in_description(name: &str) -> Option<RobotDescription> {
         let (_, description, ..) = BUILT_IN.into_iter().find(|(known, ..)| *known == name)?;
         RobotDescription::read(description).ok()
     }
 
-    /// The URDF of the robot of this name that we ship.
+    /// The URDF of the built-in robot of this name.
     pub(crate) fn built_in_urdf(name: &str) -> Option<&'static str> {
         BUILT_IN.into_iter().find(|(known, ..)| *known == name).map(|(_, _, urdf, _)| urdf)
     }
 
-    /// The robot of this name that we ship.
+    /// The built-in robot of this name.
     pub fn built_in(name: &str) -> Option<Robot> {
         let (_, description, urdf, srdf) = BUILT_IN.into_iter().find(|(known, ..)| *known == name)?;
         let read = RobotDescription::read(description).and_then(|description| {
@@ -312,24 +312,23 @@ impl Robot {
         }
     }
 
-    /// Reads a robot from a description and the texts of the URDF and SRDF that it names; `load` returns the bytes of a mesh file that the
-    /// URDF names.
+    /// Reads a robot from a description and the texts of the URDF and SRDF that it refers to; `load` returns the bytes of a mesh file of the URDF.
     ///
     /// # Errors
-    /// [`RobotFault`] names the link, joint or posture that does not fit.
+    /// [`RobotFault`] gives the link, joint or posture and its error.
     pub fn of(
         description: RobotDescription,
         urdf: &str,
         srdf: Option<&str>,
         load: &mut dyn FnMut(&str) -> Result<Vec<u8>, MeshError>,
     ) -> Result<Robot, RobotFault> {
-        // What needs no shapes is said before the meshes are read, which takes seconds; and what is wrong with any arm at once.
+        // Errors that do not concern shapes are found before the meshes are read, which takes seconds; and errors of any arm at once.
         let outline = Robot::on(description.clone(), RobotModel::outline(urdf, srdf)?)?;
         outline.other_arms().try_for_each(|arm| outline.with_arm(arm).map(drop))?;
         Robot::on(description, RobotModel::read_with_covers(urdf, srdf, load)?)
     }
 
-    /// Holds a description against a robot. Its shapes are not looked at.
+    /// Applies a description to a robot model. The shapes are not used.
     fn on(description: RobotDescription, model: RobotModel) -> Result<Robot, RobotFault> {
         let link = |key: &'static str, name: &str| {
             let known = model.links.iter().map(|link| link.name.as_str());
@@ -384,17 +383,17 @@ impl Robot {
         }
     }
 
-    /// The robot's name, for messages.
+    /// The robot's name in messages.
     pub fn name(&self) -> &str {
         &self.description.name
     }
 
-    /// The table, the boxes and their places in its cell; none of a robot that has no cell.
+    /// The table, the boxes and their places in its cell; `None` for a robot without a cell.
     pub fn workplace(&self) -> Option<&Workplace> {
         self.description.workplace.as_ref()
     }
 
-    /// Everything at zero, or at the limit next to it, at the world's origin.
+    /// All positions at zero, or at the limit next to it; the base at the world's origin.
     pub fn at_zero(&self) -> Configuration {
         let at = |part: &Option<Part>, j: usize| part.as_ref().map_or(0.0, |part| self.neutral[part.indices[j]]);
         Configuration {
@@ -407,7 +406,7 @@ impl Robot {
         }
     }
 
-    /// The inverse of [`Configuration::values`], with the other arms or without; `None` where the number of values is another.
+    /// The inverse of [`Configuration::values`], with or without the other arms; `None` for any other number of values.
     pub fn configuration(&self, values: &[f64]) -> Option<Configuration> {
         let (own, of_others) = (self.arm.joints.len() + 6, self.other_arms.iter().map(OtherArm::values).sum::<usize>());
         if values.len() != own && values.len() != own + of_others {
@@ -456,12 +455,12 @@ impl Robot {
         positions
     }
 
-    /// What is planned for where the arm alone moves, and everything else is as in a configuration.
+    /// The mechanism in which only the arm moves, and all other parts are as in a configuration.
     pub(crate) fn arm(&self, configuration: &Configuration) -> Mechanism {
         self.model.restricted(&self.arm.indices, &self.positions(configuration))
     }
 
-    /// The arm's joints on the way to a link; everything else is as in a configuration.
+    /// The chain to a link in which only the arm's joints move, and all other parts are as in a configuration.
     pub(crate) fn arm_chain(&self, configuration: &Configuration, link: usize) -> Chain {
         let positions = self.positions(configuration);
         Chain::to(link, &self.model.links, |link| link.moved_by(&self.arm.indices, &positions))
@@ -472,52 +471,52 @@ impl Robot {
         &self.arm.joints
     }
 
-    /// Whether each joint of the arm slides: then its positions are metres, else radians.
+    /// Whether each joint of the arm is prismatic: then its positions are in metres, else in radians.
     pub fn arm_slides(&self) -> &[bool] {
         &self.arm.slides
     }
 
-    /// The limits of the base's x, y and heading, x and y within its area; none of a robot that stands.
+    /// The limits of the base's x, y and heading, x and y within its area; empty for a robot without a base.
     pub fn base_joints(&self) -> &[Joint] {
         self.base.as_ref().map_or(&[], |base| &base.joints)
     }
 
-    /// The finger's joint: its upper limit is half of the greatest opening. None of a robot without a gripper.
+    /// The finger's joint: its upper limit is half of the maximum opening. `None` for a robot without a gripper.
     pub fn finger(&self) -> Option<&Joint> {
         self.finger.as_ref().map(|finger| &finger.joints[0])
     }
 
-    /// Half of the widest that the fingers open, in metres; 0 without a gripper.
+    /// Half of the maximum opening of the fingers, in metres; 0 without a gripper.
     pub fn open_finger_m(&self) -> f64 {
         self.finger().map_or(0.0, |finger| finger.upper)
     }
 
-    /// The limits of pan and tilt; none of a robot without a head.
+    /// The limits of pan and tilt; empty for a robot without a head.
     pub fn head_joints(&self) -> &[Joint] {
         self.head.as_ref().map_or(&[], |head| &head.joints)
     }
 
-    /// The links that pan and tilt move; none of a robot without a head.
+    /// The links that pan and tilt move; empty for a robot without a head.
     pub fn head_links(&self) -> Vec<usize> {
         self.head.as_ref().map_or_else(Vec::new, |head| head.moved_links(&self.model))
     }
 
-    /// The link that carries the fingers.
+    /// The link to which the fingers are attached.
     pub fn hand(&self) -> Option<usize> {
         self.gripper.map(|[hand, _]| hand)
     }
 
-    /// A finger.
+    /// The link of one finger.
     pub fn finger_link(&self) -> Option<usize> {
         self.gripper.map(|[_, finger]| finger)
     }
 
-    /// The links of all fingers: what the gripper's joint moves, by itself or through joints that mimic it.
+    /// The links of all fingers: those that the gripper's joint moves, directly or through joints that mimic it.
     pub fn finger_links(&self) -> Vec<usize> {
         self.finger.as_ref().map_or_else(Vec::new, |finger| finger.moved_links(&self.model))
     }
 
-    /// The body of the base, on top of which things ride along.
+    /// The body of the base; objects on top of it ride on the base.
     pub fn body(&self) -> Option<usize> {
         self.body
     }
@@ -532,7 +531,7 @@ impl Robot {
         self.model.poses(&self.positions(configuration))
     }
 
-    /// Recomputes in place what the arm moves; the rest of the configuration is as when the poses were computed.
+    /// Recomputes in place the poses of the links that the arm moves; the rest of the configuration must not have changed.
     pub(crate) fn update_arm(&self, configuration: &Configuration, poses: &mut [Pose]) {
         self.model.update(&self.arm_links, &self.positions(configuration), poses);
     }
@@ -542,22 +541,22 @@ impl Robot {
         self.poses(configuration)[link]
     }
 
-    /// The tool frame in the world frame.
+    /// The pose of the tool frame in the world frame.
     pub fn tool_pose(&self, configuration: &Configuration) -> Pose {
         self.pose(configuration, self.tool)
     }
 
-    /// The camera's optical frame in the world frame; none of a robot without a camera.
+    /// The pose of the camera's optical frame in the world frame; `None` for a robot without a camera.
     pub fn camera_pose(&self, configuration: &Configuration) -> Option<Pose> {
         self.camera.map(|camera| self.pose(configuration, camera))
     }
 
-    /// Pan and tilt that point the camera at a point of the world, held within their limits, where the rest of the robot is as in `here`.
+    /// Pan and tilt that point the camera at a point of the world, within their limits, with the rest of the robot as in `here`.
     pub fn look_at(&self, here: &Configuration, target: [f64; 3]) -> (f64, f64) {
         let ahead = self.at_zero();
         let mut looking = Configuration { pan: ahead.pan, tilt: ahead.tilt, ..*here };
         let [pan, tilt] = self.head_joints() else { return (looking.pan, looking.tilt) };
-        // The optical centre sits off the tilt axis: a few rounds make up for it.
+        // The optical centre is off the tilt axis: a few iterations compensate for it.
         for _ in 0..8 {
             let Some(camera) = self.camera_pose(&looking) else { break };
             let seen = camera.inverse().transform(target);
@@ -569,14 +568,13 @@ impl Robot {
         (pan.counted_from(here.pan, looking.pan), tilt.counted_from(here.tilt, looking.tilt))
     }
 
-    /// All that touches by the exact shapes, the deepest first: what stands there and any link, and links of the robot of which the arm moves one
-    /// against the other.
+    /// All collisions by the exact shapes, deepest first: of obstacles with any link, and of links of the robot that the arm moves relative to each other.
     pub fn touches(&self, configuration: &Configuration, standing: &[Obstacle]) -> Vec<Touch> {
         let mechanism = self.arm(configuration);
         Exact::new(&mechanism, standing).touches(&configuration.arm)
     }
 
-    /// Every collision shape with its place in the world and the index of its link, for rendering.
+    /// Every collision shape with its pose in the world and the index of its link, for rendering.
     pub fn shapes(&self, configuration: &Configuration) -> Vec<(usize, Pose32, SharedShape)> {
         let poses = self.poses(configuration);
         let bodies = self.model.links.iter().enumerate().flat_map(|(i, link)| link.bodies.iter().map(move |b| (i, b)));
@@ -606,7 +604,7 @@ impl Part {
         Ok(Part { indices, joints, slides })
     }
 
-    /// The links that its joints move, parents before children.
+    /// The links that the part's joints move, parents before children.
     fn moved_links(&self, model: &RobotModel) -> Vec<usize> {
         let mut moved = vec![false; model.links.len()];
         for (i, link) in model.links.iter().enumerate() {
@@ -616,7 +614,7 @@ impl Part {
         (0..moved.len()).filter(|i| moved[*i]).collect()
     }
 
-    /// For each joint the link on the way to the tool that it moves.
+    /// For each joint the link on the chain to the tool that it moves.
     fn links_to(&self, model: &RobotModel, tool: usize) -> Result<Vec<usize>, RobotFault> {
         let way: Vec<usize> = std::iter::successors(Some(tool), |index| model.links[*index].parent).collect();
         let moved = |(index, joint): (&usize, &Joint)| {

@@ -1,39 +1,39 @@
-//! Where every joint of a robot is: those that are planned for, and those that stand still meanwhile.
+//! The positions of all joints of a robot: those that are planned, and those that stand still.
 
 use crate::robot_model::{Joint, RobotModel};
 use std::collections::BTreeMap;
 
-/// A position for each joint of a [`RobotModel`], in radians (metres for a joint that slides). Joints that mimic follow.
+/// A position for each joint of a [`RobotModel`], in radians (metres for a prismatic joint). Mimic joints follow.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RobotState {
     positions: Vec<f64>,
 }
 
-/// A position that a joint cannot be given.
+/// Why a joint cannot have a position.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum StateError {
-    /// No such joint.
+    /// There is no such joint.
     #[error("the robot has no joint `{joint}` that moves")]
     Unknown {
         /// Its name.
         joint: String,
     },
-    /// It has no position of its own.
+    /// The joint mimics another one.
     #[error("joint `{joint}` mimics another: give the position of that one")]
     Mimics {
         /// Its name.
         joint: String,
     },
-    /// Not within the limits.
+    /// The position is beyond the limits.
     #[error("joint `{joint}` cannot be at {position}: its limits are {lower} to {upper}")]
     Beyond {
         /// Its name.
         joint: String,
-        /// As given.
+        /// The given position.
         position: f64,
-        /// Its least position.
+        /// Its lower limit.
         lower: f64,
-        /// Its greatest position.
+        /// Its upper limit.
         upper: f64,
     },
 }
@@ -45,7 +45,7 @@ impl RobotState {
         RobotState { positions: model.joints.iter().map(rest).collect() }
     }
 
-    /// The same with some joints elsewhere.
+    /// The same with other positions of some joints.
     ///
     /// # Errors
     /// [`StateError`] names the joint.

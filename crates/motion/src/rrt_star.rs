@@ -1,12 +1,12 @@
-//! Informed RRT\*: one tree of shortest ways from the start, which goes on getting better as long as there are samples.
+//! Informed RRT\*: a tree of shortest paths from the start, which improves with every sample.
 //!
-//! A new posture joins the tree by the neighbour over which it is nearest to the start, and neighbours that are nearer over it
-//! turn to it (Karaman and Frazzoli: *Sampling-based algorithms for optimal motion planning*, IJRR 2011; the k nearest, k growing
-//! with the logarithm of the tree). Samples come from where a shorter way could run at all (Gammell, Srinivasa, Barfoot:
-//! *Informed RRT\**, IROS 2014). Motions are checked in the order of what they promise, and only until one is free. The tree is
-//! bounded: when it is full, a posture that nothing hangs on makes room (Adiyatov and Varol, ICMA 2013).
+//! A new posture is connected to the neighbour through which its path from the start is shortest, and neighbours whose path through it is shorter are
+//! rewired to it (Karaman and Frazzoli: *Sampling-based algorithms for optimal motion planning*, IJRR 2011; the k nearest, with k proportional to the
+//! logarithm of the tree's size). Samples come from the region through which a shorter path can lead (Gammell, Srinivasa, Barfoot: *Informed RRT\**,
+//! IROS 2014). Motions are checked in the order of their path lengths, until one is free. The size of the tree is bounded: when it is full, a leaf is
+//! removed (Adiyatov and Varol, ICMA 2013).
 //!
-//! There may be several ends, each with the length of what follows it. Paths that were found elsewhere can be taken in.
+//! There may be several ends, each with the length of the rest of the path after it. Paths that were found elsewhere can be added.
 
 use crate::ellipsoid;
 use crate::pace::Control;
@@ -14,25 +14,25 @@ use crate::refine::End;
 use crate::space::{Space, State, between, distance};
 use rand::{Rng, RngExt};
 
-/// Nodes at the most, beside the ends.
+/// Maximum number of nodes, without the ends.
 pub const MAX_NODES: usize = 4096;
 
-/// How far the tree grows at once, in radians.
+/// Maximum length of a new motion, in radians.
 const RANGE: f32 = 1.0;
 
-/// One of so many samples is an end.
+/// One in this many samples is an end.
 const ENDS_AMONG_SAMPLES: u32 = 24;
 
-/// Ends that a new posture is joined to at the most.
+/// Maximum number of ends that a new posture is connected to.
 const ENDS_AT_ONCE: usize = 2;
 
-/// A way must be shorter by this much for a node to turn to it, in radians: more than rounding is.
+/// Minimum gain for rewiring a node, in radians: more than rounding errors.
 const LEAST_GAIN: f32 = 1e-5;
 
-/// Slots looked at for a node that is of no use, before any other has to go.
+/// Number of slots that are searched for a useless node, before any leaf is removed.
 const LOOK: usize = 64;
 
-/// Nodes of one block of coordinates.
+/// Number of nodes in a block of coordinates.
 const WIDTH: usize = 16;
 
 /// The tree.
@@ -41,34 +41,34 @@ pub struct RrtStar {
     joints: usize,
     /// Positions of 16 nodes, a row per joint; unused ones are infinite.
     rows: Vec<[f32; WIDTH]>,
-    /// The root first.
+    /// The root is the first.
     nodes: Vec<Node>,
     /// The node of each end that the tree has reached.
     ends: Vec<Option<usize>>,
-    /// Room for a query: squared distances and nodes, the nearest first.
+    /// Buffer for a query: squared distances and nodes, nearest first.
     near: Vec<(f32, usize)>,
-    /// Where room is looked for next.
+    /// The slot at which the search for a leaf to remove continues.
     cursor: usize,
-    /// Nodes at the most, beside the ends.
+    /// Maximum number of nodes, without the ends.
     most: usize,
 }
 
 #[derive(Debug, Clone)]
 struct Node {
     state: State,
-    /// The root is its own.
+    /// The root is its own parent.
     parent: usize,
     children: Vec<usize>,
     /// Length of the motion from the parent.
     edge: f32,
-    /// Length of the way from the root.
+    /// Length of the path from the root.
     cost: f32,
-    /// Least length of what can follow.
+    /// Minimum length of the rest of the path.
     rest: f32,
 }
 
 impl RrtStar {
-    /// A tree with nothing but its root, which is free.
+    /// A tree with only its root, which is free.
     pub fn new(start: &State, joints: usize) -> RrtStar {
         let mut tree = RrtStar {
             joints,
@@ -83,20 +83,20 @@ impl RrtStar {
         tree
     }
 
-    /// How many postures it has.
+    /// Number of nodes.
     #[allow(clippy::len_without_is_empty, reason = "there always is the root")]
     pub fn len(&self) -> usize {
         self.nodes.len()
     }
 
-    /// The end with the shortest way to it and what follows it, and the length of both, in radians.
+    /// The end with the shortest whole path, including the rest after it, and the length of that, in radians.
     pub fn best(&self, ends: &[End]) -> Option<(usize, f32)> {
         let reached = self.ends.iter().zip(ends).enumerate();
         let lengths = reached.filter_map(|(i, (node, end))| node.map(|node| (i, self.nodes[node].cost + end.rest)));
         lengths.min_by(|a, b| a.1.total_cmp(&b.1))
     }
 
-    /// The way to an end that the tree has reached.
+    /// The path to an end that the tree has reached.
     pub fn path(&self, end: usize) -> Option<Vec<State>> {
         let mut node = self.ends.get(end).copied().flatten()?;
         let mut path = vec![self.nodes[node].state];
@@ -108,11 +108,11 @@ impl RrtStar {
         Some(path)
     }
 
-    /// Grows by so many samples; ways of `limit` or longer, what follows their ends included, are of no interest. `ends` are
-    /// those of the calls before, in the same order, and perhaps more.
+    /// Grows by this number of samples; paths of length `limit` or more, including the rest after their ends, are not searched. `ends` are those of
+    /// the earlier calls, in the same order, with new ones appended.
     ///
     /// # Errors
-    /// What `control` said, when that was not to go on; the tree is whole all the same.
+    /// The answer of `control`, if it ends the growth; the tree is valid all the same.
     pub fn grow(
         &mut self,
         space: &mut Space,
@@ -149,7 +149,7 @@ impl RrtStar {
         Ok(())
     }
 
-    /// Takes in a free path from the root to the end with the index `end`; nothing of it is checked.
+    /// Adds a free path from the root to the end with the index `end`, without checking it.
     pub fn adopt(&mut self, path: &[State], ends: &[End], end: usize) {
         self.take(ends);
         let mut last = 0;
@@ -170,7 +170,7 @@ impl RrtStar {
         self.ends[end] = Some(last);
     }
 
-    /// Takes note of ends that are new.
+    /// Adds new ends.
     fn take(&mut self, ends: &[End]) {
         let known = self.ends.len();
         self.ends.resize(ends.len(), None);
@@ -180,7 +180,7 @@ impl RrtStar {
         }
     }
 
-    /// Grows towards a sample.
+    /// Grows the tree towards a sample.
     fn extend(&mut self, space: &mut Space, ends: &[End], bound: f32, sample: &State) {
         self.find_near(sample);
         let (square, nearest) = self.near[0];
@@ -204,7 +204,7 @@ impl RrtStar {
         self.join_ends(space, ends, node, bound);
     }
 
-    /// The neighbour over which a posture is nearest to the root, nearer than `bound`, and the length of the motion from it.
+    /// The neighbour through which a posture's path from the root is shortest, and shorter than `bound`, with the length of the motion from it.
     fn best_parent(&mut self, space: &mut Space, state: &State, bound: f32) -> Option<(usize, f32)> {
         let mut ways: Vec<(f32, f32, usize)> = Vec::with_capacity(self.near.len());
         for (square, node) in &self.near {
@@ -219,7 +219,7 @@ impl RrtStar {
         free.map(|(_, edge, node)| (node, edge))
     }
 
-    /// Turns a node to the neighbour over which it is nearest to the root.
+    /// Rewires a node to the neighbour through which its path from the root is shortest.
     fn look_for_better_parent(&mut self, space: &mut Space, node: usize) {
         let (state, cost) = (self.nodes[node].state, self.nodes[node].cost);
         if node == 0 {
@@ -230,7 +230,7 @@ impl RrtStar {
         }
     }
 
-    /// Turns the neighbours of a new node to it that are nearer to the root over it.
+    /// Rewires neighbours of a new node to it if that shortens their path from the root.
     fn rewire(&mut self, space: &mut Space, node: usize, bound: f32) {
         let (state, cost) = (self.nodes[node].state, self.nodes[node].cost);
         for i in 0..self.near.len() {
@@ -244,7 +244,7 @@ impl RrtStar {
         }
     }
 
-    /// Joins the ends to a new node that a shorter way leads to over it.
+    /// Connects ends to a new node if that shortens their path.
     fn join_ends(&mut self, space: &mut Space, ends: &[End], node: usize, bound: f32) {
         let (state, cost) = (self.nodes[node].state, self.nodes[node].cost);
         let mut ways: Vec<(f32, f32, usize)> = Vec::new();
@@ -271,7 +271,7 @@ impl RrtStar {
         }
     }
 
-    /// Hangs a new node on another.
+    /// Adds a new node below `parent`.
     fn add(&mut self, slot: usize, state: State, parent: usize, edge: f32, rest: f32) -> usize {
         let cost = self.nodes[parent].cost + edge;
         self.nodes[parent].children.push(slot);
@@ -279,7 +279,7 @@ impl RrtStar {
         slot
     }
 
-    /// Puts a node into a slot, the next or one that is in use.
+    /// Stores a node in a slot, which is the next one or one in use.
     fn put(&mut self, slot: usize, node: Node) {
         if slot == self.nodes.len() && slot.is_multiple_of(WIDTH) {
             self.rows.extend(std::iter::repeat_n([f32::INFINITY; WIDTH], self.joints));
@@ -294,7 +294,7 @@ impl RrtStar {
         }
     }
 
-    /// Hangs a node, and with it all that hangs on it, on another.
+    /// Moves a node, with its subtree, below another parent.
     fn turn(&mut self, node: usize, parent: usize, edge: f32) {
         let before = self.nodes[node].parent;
         self.nodes[before].children.retain(|child| *child != node);
@@ -307,12 +307,12 @@ impl RrtStar {
         }
     }
 
-    /// A slot for a node that is to hang on `parent`.
+    /// A slot for a new node below `parent`.
     fn slot(&mut self, parent: usize, bound: f32) -> Option<usize> {
         if self.nodes.len() < self.most { Some(self.nodes.len()) } else { self.make_room(parent, bound) }
     }
 
-    /// Takes a node out that nothing hangs on, one that no way of interest leads over where there is one about, and gives its slot.
+    /// Removes a leaf and returns its slot; preferably a leaf through which no path shorter than `bound` can lead.
     fn make_room(&mut self, keep: usize, bound: f32) -> Option<usize> {
         let mut found = None;
         let count = self.nodes.len();
@@ -334,12 +334,12 @@ impl RrtStar {
         self.cursor = slot + 1;
         let parent = self.nodes[slot].parent;
         self.nodes[parent].children.retain(|child| *child != slot);
-        // A query that is under way must not find it any more.
+        // The current query must not find it any more.
         self.near.retain(|(_, node)| *node != slot);
         Some(slot)
     }
 
-    /// Fills `near` with the nodes next to a posture.
+    /// Fills `near` with the nearest nodes to a posture.
     fn find_near(&mut self, to: &State) {
         let count = neighbours(self.nodes.len(), self.joints);
         self.near.clear();
@@ -366,13 +366,13 @@ impl RrtStar {
     }
 }
 
-/// How many neighbours a posture has in a tree of so many (Karaman and Frazzoli, k-nearest RRT\*).
+/// Number of neighbours in a tree of this size (Karaman and Frazzoli, k-nearest RRT\*).
 fn neighbours(nodes: usize, joints: usize) -> usize {
     let per_logarithm = std::f32::consts::E * (1.0 + 1.0 / joints as f32);
     ((per_logarithm * ((nodes + 1) as f32).ln()).ceil() as usize).max(1)
 }
 
-/// The least length of what can follow a posture.
+/// The minimum length of the path after a posture.
 fn rest(ends: &[End], state: &State) -> f32 {
     ends.iter().map(|end| distance(state, &end.state) + end.rest).fold(f32::INFINITY, f32::min)
 }

@@ -1,20 +1,20 @@
-//! Numbers as files with binary records hold them.
+//! Number formats of binary files.
 
-/// How a number is stored.
+/// The storage format of a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Scalar {
-    /// Whole numbers of so many bytes, 1, 2, 4 or 8; with a sign,
+    /// A signed integer of 1, 2, 4 or 8 bytes.
     Signed(usize),
-    /// without,
+    /// An unsigned integer of 1, 2, 4 or 8 bytes.
     Unsigned(usize),
-    /// and IEEE 754 of 4
+    /// IEEE 754 single precision, 4 bytes.
     Single,
-    /// and of 8 bytes.
+    /// IEEE 754 double precision, 8 bytes.
     Double,
 }
 
 impl Scalar {
-    /// In bytes.
+    /// The size in bytes.
     pub(crate) fn size(self) -> usize {
         match self {
             Scalar::Signed(size) | Scalar::Unsigned(size) => size,
@@ -23,7 +23,7 @@ impl Scalar {
         }
     }
 
-    /// The number at the beginning of some bytes; `None` where there are too few.
+    /// The number at the beginning of `bytes`; `None` if there are too few.
     pub(crate) fn read(self, bytes: &[u8], is_big_endian: bool) -> Option<f64> {
         let bytes = bytes.get(..self.size())?;
         let mut eight = [0; 8];

@@ -1,7 +1,7 @@
-//! What a depth camera saw, as an obstacle of one motion.
+//! The points that a depth camera saw, as an obstacle for one motion.
 //!
-//! A camera sees the robot and the objects of the scene, too. These are known already, by better shapes than balls about points, so the
-//! points at them are left out. What is left is nothing that anybody knows: the motion keeps away from it.
+//! A camera sees the robot and the objects of the scene, too. These are known already, with better shapes than balls about points, so their points
+//! are left out. The remaining points belong to unknown objects: the motion keeps away from them.
 
 use crate::cloud::{Cloud, CloudError};
 use crate::frame::compose;
@@ -10,23 +10,23 @@ use crate::robot::{Body, Configuration, Geometry, Robot, to_f32};
 use ratn_world::scene::{Placement, Scene};
 use std::sync::Arc;
 
-/// How near a point is to a known shape that it is taken to be of it, in metres: what depth cameras err by, where nobody says otherwise.
+/// Default distance within which a point belongs to a known shape, in metres: the error of depth cameras.
 pub const KNOWN_WITHIN_M: f64 = 0.02;
 
 /// Balls about the points that a depth camera saw.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Seen {
-    /// In the world frame.
+    /// The cloud in the world frame.
     pub cloud: Arc<Cloud>,
-    /// Points so near to the robot in its start posture, or to an object of the scene, are of these, in metres.
+    /// Points within this distance of the robot in its start posture, or of an object of the scene, belong to these, in metres.
     pub known_within_m: f64,
 }
 
 impl Seen {
-    /// What is left of it beside the robot and the scene, in the world frame.
+    /// The points that belong neither to the robot nor to the scene, in the world frame.
     ///
     /// # Errors
-    /// None that the cloud does not have already.
+    /// None for a valid cloud.
     pub(crate) fn unknown(&self, robot: &Robot, scene: &Scene, here: &Configuration) -> Result<Cloud, CloudError> {
         let poses = robot.poses(here);
         let on_robot = |body: &Body, link: usize| Body { pose: compose(&poses[link], &body.pose), ..*body };
@@ -53,10 +53,10 @@ impl Seen {
         Cloud::new(&self.cloud.name, &points, self.cloud.radius_m())
     }
 
-    /// What is left of that beside the floor, at z = 0, which robots drive on.
+    /// As [`Seen::unknown`], without the points of the floor, at z = 0, on which robots drive.
     ///
     /// # Errors
-    /// None that the cloud does not have already.
+    /// None for a valid cloud.
     pub(crate) fn beside_the_floor(
         &self,
         robot: &Robot,

@@ -1,14 +1,14 @@
-//! Spheres that hold a shape: every point of it lies in one of them.
+//! Spheres that cover a shape: every point of it is in one of them.
 //!
-//! A sphere stays itself. A round column is cut into slices, a box into cells; each piece gets a sphere around it, so the
-//! cover is complete by construction, and as tight as the pieces are small.
+//! A sphere covers itself. A cylinder or capsule is cut into slices, a box into cells; each piece gets the sphere around it, so the cover is complete
+//! by construction, and the smaller the pieces, the tighter it is.
 
 use crate::geometry::{Body, Geometry};
 
-/// How far the spheres may stand out of a shape, as a part of its least extent.
+/// How far the spheres may stand out of a shape, as a share of its minimum extent.
 const OVERSHOOT: f64 = 0.25;
 
-/// Pieces along one edge at the most.
+/// Maximum number of pieces along one edge.
 const MAX_PIECES: usize = 16;
 
 /// A sphere in a link's frame, in metres.
@@ -20,7 +20,7 @@ pub struct Sphere {
     pub radius: f64,
 }
 
-/// Spheres, in the link's frame, that hold a body.
+/// Spheres, in the link's frame, that cover a body.
 pub fn cover(body: &Body) -> Vec<Sphere> {
     let least = match body.geometry {
         Geometry::Box { half } => return placed(body, cells(half, least(half) * (1.0 + OVERSHOOT))),
@@ -33,8 +33,8 @@ pub fn cover(body: &Body) -> Vec<Sphere> {
     cover_within(body, least * OVERSHOOT)
 }
 
-/// As [`cover`], standing out of the body by at most `overhang_m` metres, unless that takes too many pieces; the ends of a
-/// cylinder stand out further.
+/// As [`cover`], standing out of the body by at most `overhang_m` metres, unless that takes too many pieces; at the ends of a cylinder the spheres
+/// stand out further.
 pub fn cover_within(body: &Body, overhang_m: f64) -> Vec<Sphere> {
     // A cube of half edge h stands out by (√3 - 1) h.
     let cell = overhang_m / (3_f64.sqrt() - 1.0);
@@ -58,7 +58,7 @@ fn least(half: [f64; 3]) -> f64 {
     half.into_iter().fold(f64::INFINITY, f64::min)
 }
 
-/// Half the height of a slice of a round column that stands out by so much.
+/// Half the height of a slice of a cylinder whose sphere stands out by `overhang`.
 fn slice(radius: f64, overhang: f64) -> f64 {
     ((radius + overhang).powi(2) - radius.powi(2)).sqrt()
 }
@@ -71,7 +71,7 @@ fn beads(radius: f64, half_length: f64, overhang: f64) -> Vec<Sphere> {
     (0..=pieces).map(|i| Sphere { centre: [0.0, 0.0, at(i)], radius: radius.hypot(half) }).collect()
 }
 
-/// A cylinder along y, as parry has it.
+/// A cylinder along y, as in parry.
 fn slices(radius: f64, half_length: f64, overhang: f64) -> Vec<Sphere> {
     let pieces = pieces(half_length, slice(radius, overhang));
     let half = half_length / pieces as f64;

@@ -1,16 +1,16 @@
-//! Reading STL: binary by its length, or text between `solid` and `endsolid`.
+//! Reads STL: binary files, recognised by their length, or text between `solid` and `endsolid`.
 //!
-//! Normals, colours and names say nothing of the shape. A text that ends before its `endsolid` was cut off and is refused.
+//! Normals, colours and names do not affect the shape. A text without its `endsolid` was truncated and is refused.
 
 use crate::mesh::{MAX_TRIANGLES, MeshError};
 
 type Triangle = [[f64; 3]; 3];
 
-/// Bytes before the triangles of a binary file, and of each of them.
+/// Bytes before the triangles of a binary file, and bytes of each triangle.
 const HEADER: usize = 84;
 const RECORD: usize = 50;
 
-/// Where a binary record has its first corner: after the normal.
+/// The offset of the first corner in a binary record: after the normal.
 const CORNERS: usize = 12;
 
 /// The triangles of a file.
@@ -19,7 +19,7 @@ pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
     let count = announced.map_or(0, |count| count as usize);
     let cut = || MeshError::Triangles { triangles: count, bytes: bytes.len() };
     let is_whole = |records: &[u8]| count.checked_mul(RECORD) == Some(records.len());
-    // A binary header may begin with `solid`, the length decides.
+    // A binary header may begin with `solid`, so the length decides.
     match bytes.get(HEADER..).filter(|records| is_whole(records)) {
         Some(_) if !(1..=MAX_TRIANGLES).contains(&count) => Err(cut()),
         Some(records) => Ok(records.chunks_exact(RECORD).map(record).collect()),
@@ -39,11 +39,11 @@ fn is_text(text: &str) -> bool {
     text.split_whitespace().next().is_some_and(|word| word.eq_ignore_ascii_case("solid"))
 }
 
-/// What a text has open.
+/// The open element of a text.
 enum Open {
     Nothing,
     Solid,
-    /// With its corners so far.
+    /// A facet with its corners so far.
     Facet(Vec<[f64; 3]>),
 }
 
@@ -79,7 +79,7 @@ fn lines(text: &str) -> Result<Vec<Triangle>, MeshError> {
             }
             ("endsolid", Open::Solid) => Open::Nothing,
             ("solid" | "facet" | "vertex" | "endfacet" | "endsolid", _) => return Err(wrong),
-            // `outer loop`, `endloop`, and what some writers add.
+            // `outer loop`, `endloop`, and extensions of some writers.
             (_, open) => open,
         };
     }

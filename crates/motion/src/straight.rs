@@ -1,6 +1,6 @@
-//! A straight part of a motion of the tool: how far it goes, in which direction, and in whose frame that direction is given.
+//! A straight part of a tool motion: its length, its direction, and the frame of that direction.
 //!
-//! The tool keeps its rotation along the part. What the arm does for it: `line`.
+//! The tool keeps its rotation along the part. `line` computes the motion of the arm.
 
 use crate::frame::norm;
 use crate::plan::PlanError;
@@ -8,34 +8,34 @@ use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene};
 use std::fmt;
 
-/// The longest straight part, in metres.
+/// Maximum length of a straight part, in metres.
 pub const MAX_STRAIGHT_M: f64 = 0.5;
 
-/// A direction that is shorter has none.
+/// Minimum length of a direction vector.
 const LEAST_DIRECTION: f64 = 1e-6;
 
-/// The most objects that an error names.
+/// Maximum number of objects in an error message.
 const MAX_NAMES: usize = 12;
 
-/// A straight part of a motion; none where its length is 0.
+/// A straight part of a motion; there is none if its length is 0.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Straight {
-    /// Where the tool moves; of any length but zero.
+    /// Direction of the tool's motion; of any length but zero.
     pub direction: [f64; 3],
-    /// Whose axes `direction` is along.
+    /// The frame of `direction`.
     pub frame: Frame,
-    /// How far it goes, in metres.
+    /// Length of the part, in metres.
     pub length_m: f64,
 }
 
-/// Whose axes a direction is along.
+/// The frame of a direction.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Frame {
-    /// z is up.
+    /// The world: z is up.
     World,
-    /// x is ahead, z is up.
+    /// The base: x is forward, z is up.
     Base,
-    /// The tool's, whose rotation stays the same along the part.
+    /// The tool, whose rotation stays the same along the part.
     Tool,
     /// An object of the scene, by its name; held or not.
     Object(String),
@@ -63,13 +63,13 @@ impl Straight {
         Straight { direction: [0.0, 0.0, -1.0], frame: Frame::World, length_m }
     }
 
-    /// Whether there is such a part.
+    /// Whether the motion has this part.
     pub fn is_some(&self) -> bool {
         self.length_m > 0.0
     }
 
-    /// The way of the tool from the beginning of the part to its end, in the frame of the base, which is at `base`; `tool` is there, too.
-    /// None for an object that is not in the scene.
+    /// The vector from the beginning of the part to its end, in the frame of the base, whose pose is `base`; `tool` is in the base's frame, too.
+    /// `None` for an object that is not in the scene.
     pub(crate) fn way(&self, scene: &Scene, base: &Pose, tool: &Pose) -> Option<[f64; 3]> {
         let direction = self.direction.map(|c| c / norm(self.direction) * self.length_m);
         let from_world = base.inverse();
@@ -85,7 +85,7 @@ impl Straight {
         })
     }
 
-    /// Refuses what makes no sense; where there is no part, nobody looks at the frame. `which` is `approach` or `depart`.
+    /// Refuses invalid values; without a part, the frame is not checked. `which` is `approach` or `depart`.
     pub(crate) fn check(&self, which: &str, scene: &Scene) -> Result<(), PlanError> {
         let malformed = |part: &str, value: String, expected: String| {
             Err(PlanError::Malformed { what: format!("{which}_{part}"), value, expected })

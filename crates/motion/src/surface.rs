@@ -1,19 +1,19 @@
-//! The surface of a mesh held by balls of one radius: every place on it is in one of them, and their centres are on the surface, so they
-//! stand out by their radius and no more.
+//! Covers the surface of a mesh with balls of one radius: every point of it is in one of them, and their centres are on the surface, so they stand
+//! out by at most their radius.
 //!
-//! Each triangle is cut by a square grid in its plane. What is in one square has the middle of the smallest upright rectangle around it
-//! as the centre of its ball: a convex piece that touches all four sides of the rectangle holds that middle. Where only a part of space
-//! matters, what of a triangle is outside is cut off first: a ball is spent only on what is within.
+//! Each triangle is divided by a square grid in its plane. The piece in a square gets a ball about the centre of its bounding rectangle along the
+//! grid: a convex piece that touches all four sides of the rectangle contains that centre. If only a part of space matters, the outside parts of
+//! triangles are cut off first, so that no ball is wasted on them.
 
 use crate::mesh::Mesh;
 
-/// Balls on one mesh, about, beside one for each triangle: a mesh that needs more gets larger ones.
+/// Approximate maximum number of balls on one mesh, in addition to one per triangle: a mesh that needs more gets larger balls.
 pub const MOST_SAMPLES: usize = 300_000;
 
-/// From one radius that is tried to the next.
+/// Factor between one tested radius and the next.
 const LARGER: f64 = 1.1;
 
-/// A part of space: least and greatest coordinates.
+/// An axis-aligned box: minimum and maximum coordinates.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Bounds {
     pub(crate) least: [f64; 3],
@@ -24,7 +24,7 @@ impl Bounds {
     /// All of space.
     pub(crate) const EVERYWHERE: Bounds = Bounds { least: [f64::NEG_INFINITY; 3], greatest: [f64::INFINITY; 3] };
 
-    /// About points; nothing where there are none.
+    /// The bounding box of points; empty without points.
     pub(crate) fn about(points: impl Iterator<Item = [f64; 3]>) -> Bounds {
         let nothing = Bounds { least: [f64::INFINITY; 3], greatest: [f64::NEG_INFINITY; 3] };
         points.fold(nothing, |around, p| Bounds {
@@ -33,7 +33,7 @@ impl Bounds {
         })
     }
 
-    /// What is in both; `None` where nothing is.
+    /// The intersection; `None` if it is empty.
     pub(crate) fn and(&self, other: &Bounds) -> Option<Bounds> {
         let both = Bounds {
             least: std::array::from_fn(|i| self.least[i].max(other.least[i])),
@@ -42,12 +42,12 @@ impl Bounds {
         (0..3).all(|i| both.least[i] <= both.greatest[i]).then_some(both)
     }
 
-    /// Larger on every side.
+    /// The box grown on every side.
     pub(crate) fn grown(&self, by: f64) -> Bounds {
         Bounds { least: self.least.map(|c| c - by), greatest: self.greatest.map(|c| c + by) }
     }
 
-    /// What of a triangle is within, a convex piece; nothing where less than three corners are left.
+    /// The part of a triangle inside of the box, a convex piece; empty if fewer than three corners are left.
     fn cut(&self, triangle: &[[f64; 3]; 3]) -> Vec<[f64; 3]> {
         let around = Bounds::about(triangle.iter().copied());
         let mut piece = triangle.to_vec();
@@ -63,14 +63,14 @@ impl Bounds {
     }
 }
 
-/// The radius of the balls for this mesh and a radius wanted, in metres.
+/// The radius of the balls for this mesh and a wanted radius, in metres.
 pub fn radius(mesh: &Mesh, wanted: f64) -> f64 {
     balls(mesh.triangles(), &Bounds::EVERYWHERE, wanted, MOST_SAMPLES).0
 }
 
-/// The radius of the balls for what of some triangles is within bounds, `most` of them beside one for each, and about how many they are.
+/// The radius of the balls for the parts of triangles within bounds, with at most `most` balls in addition to one each, and the approximate number of balls.
 pub(crate) fn balls(triangles: &[[[f64; 3]; 3]], within: &Bounds, wanted: f64, most: usize) -> (f64, usize) {
-    // Of each piece, its area and its longest extent.
+    // The area and the longest extent of each piece.
     let sizes: Vec<[f64; 2]> =
         triangles.iter().filter_map(|t| Piece::new(t, within)).map(|piece| piece.size()).collect();
     let more = |radius: f64| {
@@ -79,7 +79,7 @@ pub(crate) fn balls(triangles: &[[[f64; 3]; 3]], within: &Bounds, wanted: f64, m
             |[area, long]: &[f64; 2]| if *long <= side { 0.0 } else { area / (side * side) + long / side };
         sizes.iter().map(beside_first).sum::<f64>()
     };
-    // Always of the same series, so that less of a mesh has no larger balls.
+    // The radii are always from the same series, so that a part of a mesh has no larger balls than the whole.
     let mut radius = wanted;
     while more(radius) > most as f64 {
         radius *= LARGER;
@@ -87,7 +87,7 @@ pub(crate) fn balls(triangles: &[[[f64; 3]; 3]], within: &Bounds, wanted: f64, m
     (radius, sizes.len() + more(radius) as usize)
 }
 
-/// The centres of the balls that hold what of some triangles is within bounds.
+/// The centres of the balls that cover the parts of triangles within bounds.
 pub(crate) fn centres(triangles: &[[[f64; 3]; 3]], within: &Bounds, radius: f64) -> Vec<[f64; 3]> {
     let mut centres = Vec::new();
     for triangle in triangles {
@@ -98,12 +98,12 @@ pub(crate) fn centres(triangles: &[[[f64; 3]; 3]], within: &Bounds, radius: f64)
     centres
 }
 
-/// The side of a square that a ball holds, a little less for rounding.
+/// The side of a square that a ball covers, slightly reduced for rounding.
 fn side(radius: f64) -> f64 {
     radius * 2_f64.sqrt() * (1.0 - 1e-6)
 }
 
-/// What of a triangle is within bounds, in a frame of its plane with x along the triangle's longest side.
+/// The part of a triangle within bounds, in a frame of its plane with x along the triangle's longest side.
 struct Piece {
     from: [f64; 3],
     x: [f64; 3],
@@ -125,7 +125,7 @@ impl Piece {
         let x = along.map(|c| c / reach);
         let normal = cross(&minus(b, a), &minus(c, a));
         let tall = length(&normal);
-        // A triangle without area is a line: any direction across will do.
+        // A triangle without area is a line: any perpendicular direction will do.
         let y = if tall > 1e-18 { cross(&normal.map(|c| c / tall), &x) } else { [0.0; 3] };
         let corners = within.cut(triangle);
         let flat: Vec<[f64; 2]> = corners.iter().map(|p| minus(p, from)).map(|p| [dot(&p, &x), dot(&p, &y)]).collect();
@@ -155,7 +155,7 @@ impl Piece {
     }
 }
 
-/// A convex piece cut into slabs of a width.
+/// Cuts a convex piece into slabs of at most this width.
 fn slabs(piece: &[[f64; 2]], axis: usize, width: f64) -> Vec<Vec<[f64; 2]>> {
     let [least, greatest] = range(piece, axis);
     let count = ((greatest - least) / width).ceil().max(1.0) as usize;
@@ -170,8 +170,8 @@ fn slabs(piece: &[[f64; 2]], axis: usize, width: f64) -> Vec<Vec<[f64; 2]>> {
     (0..count).map(slab).filter(|piece| !piece.is_empty()).collect()
 }
 
-/// The part of a polygon on one side of a plane, or of a line (Sutherland and Hodgman, CACM 1974): where `side` times what the corners have along the
-/// axis beyond `at` is 0 or more.
+/// The part of a polygon on one side of a plane, or of a line (Sutherland and Hodgman, CACM 1974): where the coordinate along the axis minus `at`,
+/// times `side`, is 0 or more.
 pub(crate) fn cut<const N: usize>(piece: &[[f64; N]], axis: usize, at: f64, side: f64) -> Vec<[f64; N]> {
     let beyond = |corner: &[f64; N]| (corner[axis] - at) * side;
     let mut kept = Vec::with_capacity(piece.len() + 1);

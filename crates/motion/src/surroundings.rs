@@ -1,4 +1,4 @@
-//! All that stands around a robot: primitive shapes, clouds of points, meshes.
+//! All obstacles around a robot: primitive shapes, point clouds, meshes.
 
 use crate::cloud::Cloud;
 use crate::mesh::Mesh;
@@ -6,28 +6,29 @@ use crate::space::Obstacle;
 use ratn_model::pose::Pose;
 use std::sync::Arc;
 
-/// How far the balls of the vector checks stand out of a mesh at most, unless it is very large, in metres.
+/// Maximum distance by which the balls of the vector checks stand out of a mesh, unless it is very large, in metres.
 pub const OVERHANG_M: f64 = 0.005;
 
-/// A mesh that stands still. Where it is closed it is solid.
+/// A static mesh. Closed parts of it are solid.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MeshObstacle {
-    /// For messages.
+    /// Its name in messages.
     pub name: String,
-    /// Where its frame is.
+    /// The pose of its frame.
     pub pose: Pose,
     /// Its triangles.
     pub mesh: Arc<Mesh>,
-    /// How far the vector checks may take it larger, in metres; for [`MOST_SAMPLES`](crate::surface::MOST_SAMPLES) balls over a large mesh, more.
+    /// How much larger the vector checks may treat it, in metres; more for a large mesh that would need over
+    /// [`MOST_SAMPLES`](crate::surface::MOST_SAMPLES) balls.
     pub overhang_m: f64,
 }
 
-/// What stands around; lists of primitive shapes become this by themselves.
+/// The obstacles; lists of primitive shapes convert to this.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Surroundings<'a> {
     /// Primitive shapes.
     pub obstacles: &'a [Obstacle],
-    /// Points.
+    /// Point clouds.
     pub clouds: &'a [Cloud],
     /// Meshes.
     pub meshes: &'a [MeshObstacle],

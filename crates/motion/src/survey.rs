@@ -1,5 +1,5 @@
-//! What a robot's description is good for, for people: what it has, how far it reaches, what of it collides, and whether boxes in its
-//! workplace can be taken from above wherever they may stand.
+//! Surveys a robot's description for people: its parts, its reach, its collisions, and whether boxes in its workplace can be grasped from above
+//! wherever they may stand.
 
 use crate::arm::{self, line};
 use crate::collision::{CONTACT_TOLERANCE_M, Checker, Contact, PADDING_M};
@@ -20,25 +20,25 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
 use std::ops::RangeInclusive;
 
-/// Postures looked at for how far the tool reaches.
+/// Number of sampled postures for the reach of the tool.
 const SAMPLES: usize = 5_000;
-/// Postures tried for one grasp.
+/// Number of postures, and of attempts to find them, for one grasp.
 const SOLUTIONS: usize = 12;
 const TRIES: usize = 40;
 
-/// How boxes may lie beside straight, in radians: half a turn later they are as before.
+/// Angles of rotated boxes, in radians: after half a turn a box is the same.
 const TURNED_RAD: [f64; 3] = [-FRAC_PI_4, FRAC_PI_4, FRAC_PI_2];
 
-/// See the module.
+/// See the module's description.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Survey {
-    /// What there is to say, a line each.
+    /// The findings, one per line.
     pub lines: Vec<String>,
-    /// What is wrong.
+    /// The faults.
     pub faults: Vec<String>,
 }
 
-/// Looks at a robot.
+/// Surveys a robot.
 pub fn survey(robot: &Robot) -> Survey {
     let has = |it: bool| if it { "yes" } else { "no" };
     let mut survey = Survey { lines: vec![format!("robot     {}", robot.name())], faults: Vec::new() };
@@ -51,7 +51,7 @@ pub fn survey(robot: &Robot) -> Survey {
     ]);
     let scene = scene(robot.workplace(), None);
     survey.add_postures(robot, &scene, "");
-    // A name that the robot has itself told is one of its arms.
+    // `with_arm` accepts every name that the robot itself lists.
     let others: Vec<Robot> = robot.other_arms().filter_map(|name| robot.with_arm(name).ok()).collect();
     for other in &others {
         let whose = format!(" of the arm `{}`", other.arm_name());
@@ -64,7 +64,7 @@ pub fn survey(robot: &Robot) -> Survey {
         Some(workplace) => {
             for (what, points) in [("boxes", region(workplace, &workplace.boxes)), ("places", workplace.places.poses())]
             {
-                // Boxes stand where the first arm takes them; it may be another one that brings them away.
+                // Boxes are where the first arm takes them; another arm may bring them to their places.
                 let others = if what == "places" { &others[..] } else { &[] };
                 let able = others.iter().filter(|other| other.posture(HOME).is_some());
                 let serves = |point: &Pose| able.clone().any(|other| beyond(other, workplace, point).is_none());
@@ -96,7 +96,7 @@ pub fn survey(robot: &Robot) -> Survey {
 }
 
 impl Survey {
-    /// What an arm is, of the robot seen from it.
+    /// Adds a description of an arm; `robot` is seen from it.
     fn add_arm(&mut self, robot: &Robot, whose: &str) {
         let joints: Vec<&str> = robot.arm_joints().iter().map(|joint| joint.name.as_str()).collect();
         let tool = &robot.model.links[robot.tool].name;
@@ -115,7 +115,7 @@ impl Survey {
         ]);
     }
 
-    /// Which pairs of links are not checked though no SRDF says so, which the search does not see, and which are in the way of every motion.
+    /// Adds the pairs of links that are not checked although no SRDF excepts them, those that the search does not check, and those that block every motion.
     fn add_pairs(&mut self, robot: &Robot) {
         let (model, checks) = (&robot.model, robot.model.checks());
         let says = match (model.has_exceptions(), checks.unsaid.is_empty()) {
@@ -140,8 +140,8 @@ impl Survey {
         }
     }
 
-    /// Where the postures of that arm bring its tool, and whether they collide with the table or the robot itself, whose other arms stand in
-    /// their postures `home`, or leave the planner no room.
+    /// Adds the tool position of each posture of this arm, and whether the posture collides with the table or the robot itself, whose other arms are
+    /// in their postures `home`, or leaves the planner no free space.
     fn add_postures(&mut self, robot: &Robot, scene: &Scene, whose: &str) {
         let mut checker = Checker::new(robot, scene, &arm::assumed(robot, scene), PADDING_M);
         for (name, posture) in robot.postures() {
@@ -159,12 +159,12 @@ impl Survey {
     }
 }
 
-/// The names of pairs, behind a colon.
+/// The names of pairs after a colon.
 fn listed(model: &RobotModel, pairs: &BTreeSet<Pair>) -> String {
     if pairs.is_empty() { String::new() } else { format!(": {}", pairs::named(model, &mut pairs.iter(), usize::MAX)) }
 }
 
-/// The tool's least and greatest height, and how far it gets from the arm's first joint.
+/// The tool's minimum and maximum height, and its maximum distance from the arm's first joint.
 fn extent(robot: &Robot) -> [f64; 3] {
     let reach = arm::reach(robot);
     let joints = robot.arm_joints();
@@ -181,7 +181,7 @@ fn extent(robot: &Robot) -> [f64; 3] {
     extent
 }
 
-/// All places of a joint: of one that turns further than a whole turn, one turn of them, about zero where its limits allow.
+/// All positions of a joint; for one with more than a whole turn, one turn, about zero if its limits allow that.
 fn range(Joint { lower, upper, .. }: &Joint, slides: bool) -> RangeInclusive<f64> {
     if slides || upper - lower <= TAU {
         return *lower..=*upper;
@@ -190,7 +190,7 @@ fn range(Joint { lower, upper, .. }: &Joint, slides: bool) -> RangeInclusive<f64
     least..=least + TAU
 }
 
-/// The corners and the middle of the region in which boxes stand.
+/// The corners and the centre of the region for boxes.
 fn region(workplace: &Workplace, boxes: &Boxes) -> Vec<Pose> {
     let ([x_low, x_high], [y_low, y_high]) = (boxes.x, boxes.y);
     let middle = ((x_low + x_high) / 2.0, (y_low + y_high) / 2.0);
@@ -198,8 +198,8 @@ fn region(workplace: &Workplace, boxes: &Boxes) -> Vec<Pose> {
     points.map(|(x, y)| Pose::at(x, y, workplace.table.top_m())).to_vec()
 }
 
-/// Why boxes that lie turned can be taken nowhere, with all ways to lie of which that is so for one reason; nothing where straight ones cannot be
-/// either. The cell lays them turned anyhow, where they can be taken.
+/// Why rotated boxes cannot be grasped anywhere in the region, with all such angles that have the same reason; empty if unrotated boxes cannot be
+/// grasped either. The cell rotates boxes anyway, where they can be grasped.
 fn turned(robot: &Robot, workplace: &Workplace, boxes: &Boxes) -> Vec<String> {
     let points = region(workplace, boxes);
     let nowhere = |yaw: f64| {
@@ -238,7 +238,7 @@ fn scene(workplace: Option<&Workplace>, floor: Option<&Pose>) -> Scene {
     Scene { base: Pose::IDENTITY, objects: standing.into_iter().chain([table]).collect() }
 }
 
-/// Why a box on this point cannot be taken from above, if so.
+/// Why a box on this point cannot be grasped from above, if so.
 fn beyond(robot: &Robot, workplace: &Workplace, floor: &Pose) -> Option<String> {
     let scene = scene(Some(workplace), Some(floor));
     let (reach, home) = (arm::reach(robot), robot.posture(HOME)?);
@@ -336,7 +336,7 @@ mod tests {
             said.contains("turned by -45°, 45°, 90°") && said.contains("no posture of the arm gets there"),
             "{said}"
         );
-        // Where not even a straight one can be taken, that says it all.
+        // If not even an unrotated box can be grasped, that error is enough.
         let nowhere = faults_from("lower='0.3' upper='0.4'", "0.3");
         assert!(!nowhere.is_empty() && nowhere.iter().all(|fault| !fault.contains("turned")), "{nowhere:?}");
     }

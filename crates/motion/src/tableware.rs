@@ -1,18 +1,18 @@
-//! Where tableware stands in a cell: a rack on the table, rows of places on it, and rows of places on the table to which things are brought.
+//! The tableware in a cell: a rack on the table, rows of places on it, and rows of target places on the table.
 //!
-//! It is `[workplace.tableware]` of a `robot.toml`; a robot without it has no such scene. Metres in the world frame. Rows go along y: those on
-//! the rack to the right, those on the table to the left.
+//! This is `[workplace.tableware]` of a `robot.toml`; a robot without it has no such scene. Metres in the world frame. Rows are along y: those on the
+//! rack to the right, those on the table to the left.
 
 use crate::workplace::Slab;
 use serde::Deserialize;
 
-/// See the module.
+/// See the module's description.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tableware {
     /// The rack's board, on the table.
     pub rack: Slab,
-    /// Where on the rack somebody puts what is moved there.
+    /// The region of the rack to which an injected fault moves objects.
     pub region: Region,
     /// The rows of bowls.
     pub bowls: Rows,
@@ -22,7 +22,7 @@ pub struct Tableware {
     pub cups: Rows,
     /// The row of plates, which lie on the table from the beginning.
     pub plates: Row,
-    /// From one place of a row to the next, of bowls, forks and cups.
+    /// Distance between neighbouring places of a row of bowls, forks or cups.
     pub between: f64,
 }
 
@@ -30,13 +30,13 @@ pub struct Tableware {
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Region {
-    /// Least and greatest x.
+    /// Minimum and maximum x.
     pub x: [f64; 2],
-    /// Least and greatest y.
+    /// Minimum and maximum y.
     pub y: [f64; 2],
 }
 
-/// The rows of places for things of a kind: each is the x and the y of its first place.
+/// The rows of places for objects of a kind: x and y of the first place of each.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Rows {
@@ -50,14 +50,14 @@ pub struct Rows {
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Row {
-    /// The x and the y of its first place.
+    /// x and y of its first place.
     pub table: [f64; 2],
-    /// From one place to the next.
+    /// Distance between neighbouring places.
     pub between: f64,
 }
 
 impl Tableware {
-    /// What is wrong with it, if anything.
+    /// An error in it, if any.
     pub(crate) fn fault(&self, table: &Slab) -> Option<String> {
         let Tableware { rack, region: Region { x, y }, bowls, forks, cups, plates, between } = self;
         let on_rack = [bowls, forks, cups].map(|rows| rows.rack);

@@ -1,10 +1,10 @@
-//! Limits of how fast the tool moves and turns, along the whole of a timed curve.
+//! Limits of the tool's linear and angular speed, along a whole timed curve.
 //!
-//! The greatest speed of the tool on the curve is bounded, not sampled: at the middle of a piece it is worked out, and within the piece it
-//! differs by no more than the joints' motions and speeds do there, times the levers of the arm; pieces are halved until the bound is as
-//! close as a thousandth. Where a limit is exceeded the path is timed again with the limit as one of the path's own (`timing`), so that the motion
-//! is slower only where the tool would be too fast. What is left between the places that the timing looks at slows the whole motion by one factor, so
-//! that its fastest moment keeps the limit: whatever else held goes on to hold, and nothing but the time changes. Any robot.
+//! The maximum speed of the tool on the curve is bounded analytically, not sampled: it is computed at the middle of a piece, and within the piece it
+//! differs at most by the joints' motions and speed changes there, times the levers of the arm; pieces are halved until the bound is within a
+//! thousandth. If a limit is exceeded, the path is timed again with the limit as one of the path (`timing`), so that the motion is slower only where
+//! the tool would be too fast. Any excess that is left between the points that the timing checks slows the whole motion by one factor, so that its
+//! fastest moment keeps the limit: all other limits still hold, and nothing but the time changes. Works for any robot.
 
 use crate::joint_vector::JointVector;
 use crate::plan::PlanError;
@@ -12,23 +12,23 @@ use crate::reach::Reach;
 use crate::timing::Speed;
 use crate::trajectory::{Curve, Knot};
 
-/// How close the bound is, as a share.
+/// Maximum relative error of the bound.
 const CLOSE: f64 = 1e-3;
 
-/// Speeds below are none, in metres or radians per second: the slowest limits.
+/// The smallest allowed limits, in metres or radians per second.
 pub const LEAST_SPEED: f64 = 1e-3;
 
-/// How fast the tool may be.
+/// Limits of the tool's speed.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ToolSpeed {
-    /// Of its origin, in metres per second.
+    /// Maximum speed of its origin, in metres per second.
     pub m_per_s: Option<f64>,
-    /// Of its rotation, in radians per second.
+    /// Maximum speed of its rotation, in radians per second.
     pub rad_per_s: Option<f64>,
 }
 
 impl ToolSpeed {
-    /// Refuses what makes no sense.
+    /// Refuses invalid limits.
     pub(crate) fn check(&self) -> Result<(), PlanError> {
         for (what, limit, unit) in
             [("tool_speed_m_s", self.m_per_s, "m/s"), ("tool_turning_rad_s", self.rad_per_s, "rad/s")]
@@ -41,10 +41,10 @@ impl ToolSpeed {
         Ok(())
     }
 
-    /// The quickest curve of `time` on which the frame of `reach` is nowhere too fast. It is asked for a second one at most, with the limits.
+    /// The fastest curve of `time` on which the frame of `reach` is nowhere too fast. Calls `time` at most twice, the second time with the limits.
     ///
     /// # Errors
-    /// Those of the first curve.
+    /// The errors of the first call.
     pub fn within<E>(
         &self,
         reach: &Reach,
@@ -66,7 +66,7 @@ impl ToolSpeed {
         [self.m_per_s, self.rad_per_s].map(|limit| limit.unwrap_or(f64::INFINITY))
     }
 
-    /// The curve, the whole of it slowed by one factor if the frame of `reach` would be too fast on it.
+    /// The curve, slowed down as a whole by one factor if the frame of `reach` would be too fast on it.
     pub fn keep(&self, reach: &Reach, curve: Curve) -> Curve {
         let limits = self.limits();
         if limits == [f64::INFINITY; 2] {
@@ -78,7 +78,7 @@ impl ToolSpeed {
     }
 }
 
-/// The same motion in so many times the time.
+/// The same motion with its duration multiplied by `factor`.
 fn slowed(curve: &Curve, factor: f64) -> Curve {
     let slow = |knot: &Knot| Knot {
         time_s: knot.time_s * factor,
@@ -88,7 +88,7 @@ fn slowed(curve: &Curve, factor: f64) -> Curve {
     Curve::new(curve.knots().iter().map(slow).collect())
 }
 
-/// Bounds of the tool's greatest speed and turning on the curve: at most [`CLOSE`] above what they are, or no more than `limits`.
+/// Upper bounds of the tool's maximum speed and rotation speed on the curve: at most [`CLOSE`] too high, or not above `limits`.
 fn greatest(reach: &Reach, curve: &Curve, limits: [f64; 2]) -> [f64; 2] {
     let mut enough = limits;
     let mut bounds = [0.0_f64; 2];

@@ -5,7 +5,7 @@ use crate::joint_vector::{JointVector, PerJoint};
 use crate::robot::{Joint, Robot};
 use ratn_model::value::{Trajectory, TrajectoryPoint};
 
-/// The most points that a trajectory may have.
+/// Maximum number of points of a trajectory.
 pub const MAX_POINTS: usize = 100_000;
 
 /// A well-formed trajectory of an arm's joints, or of a base (x, y and heading); at least one knot, all of the same joints.
@@ -14,46 +14,46 @@ pub struct Curve {
     knots: Vec<Knot>,
 }
 
-/// Where the joints are, and how fast, at one moment.
+/// The positions and velocities of the joints at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Knot<P = JointVector> {
     /// Seconds since the start.
     pub time_s: f64,
-    /// Radians, or metres where a joint slides.
+    /// Radians, or metres for prismatic joints.
     pub positions: P,
     /// The same per second.
     pub velocities: P,
 }
 
-/// A trajectory that is not one of these joints.
+/// Why a trajectory is invalid for these joints.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum TrajectoryError {
-    /// Other joints.
+    /// The trajectory is for other joints.
     #[error("the trajectory moves [{joints}], it should move [{expected}]")]
     OtherJoints {
-        /// What it moves.
+        /// The joints of the trajectory.
         joints: String,
-        /// What it should.
+        /// The expected joints.
         expected: String,
     },
-    /// None, or too many.
+    /// There are no points, or too many.
     #[error("the trajectory has {points} points: expected 1 to {MAX_POINTS}")]
     Points {
-        /// How many.
+        /// Number of points.
         points: usize,
     },
-    /// A point of the wrong form.
+    /// A point is malformed.
     #[error("point {index} of the trajectory: {reason}")]
     Point {
-        /// Which one, from 0.
+        /// The index of the point, from 0.
         index: usize,
-        /// What is wrong with it.
+        /// The error.
         reason: String,
     },
 }
 
 impl Curve {
-    /// From knots of the same joints, at least one, whose times grow from 0.
+    /// A curve from knots of the same joints, at least one, whose times increase from 0.
     pub(crate) fn new(knots: Vec<Knot>) -> Curve {
         Curve { knots }
     }
@@ -61,7 +61,7 @@ impl Curve {
     /// Reads a trajectory of a robot's arm.
     ///
     /// # Errors
-    /// [`TrajectoryError`] where it is not one of this arm, or its times do not grow strictly from 0.
+    /// [`TrajectoryError`] if it is for other joints, or its times do not increase strictly from 0.
     pub fn of_arm(robot: &Robot, trajectory: &Trajectory) -> Result<Curve, TrajectoryError> {
         Curve::of(robot.arm_joints(), trajectory)
     }
@@ -69,7 +69,7 @@ impl Curve {
     /// Reads a trajectory of these joints.
     ///
     /// # Errors
-    /// [`TrajectoryError`] where it is one of others, or its times do not grow strictly from 0.
+    /// [`TrajectoryError`] if it is for other joints, or its times do not increase strictly from 0.
     pub fn of(joints: &[Joint], trajectory: &Trajectory) -> Result<Curve, TrajectoryError> {
         let names: Vec<&str> = joints.iter().map(|j| j.name.as_str()).collect();
         if trajectory.joints != names {
@@ -100,7 +100,7 @@ impl Curve {
         Ok(Curve { knots })
     }
 
-    /// The same as joints count it that are at a posture when it begins: those that turn without end may be there in another turn.
+    /// The same curve with the turns counted from `start`, the posture in which it begins: continuous joints may be there in another turn.
     pub(crate) fn counted_from(mut self, joints: &[Joint], start: &JointVector) -> Curve {
         let first = self.knots[0].positions;
         let by = JointVector::from_fn(joints.len(), |j| joints[j].counted_from(start[j], first[j]) - first[j]);
@@ -110,7 +110,7 @@ impl Curve {
         self
     }
 
-    /// As a trajectory of the task model, with the joints' names.
+    /// The curve as a trajectory of the task model, with the joints' names.
     pub fn named(&self, joints: &[Joint]) -> Trajectory {
         let point = |knot: &Knot| TrajectoryPoint {
             time_s: knot.time_s,
@@ -133,12 +133,12 @@ impl Curve {
         self.knots.last().map_or(0.0, |k| k.time_s)
     }
 
-    /// Where the trajectory ends.
+    /// The end positions.
     pub fn end(&self) -> JointVector {
         self.knots[self.knots.len() - 1].positions
     }
 
-    /// Where the joints are at a moment; before the start and after the end it stands.
+    /// Positions and velocities at a time; before the start and after the end the joints stand.
     pub fn sample(&self, time_s: f64) -> Knot {
         let next = self.knots.partition_point(|k| k.time_s <= time_s);
         if next == 0 || next == self.knots.len() {
@@ -148,7 +148,7 @@ impl Curve {
         hermite(&self.knots[next - 1], &self.knots[next], time_s)
     }
 
-    /// What each joint does from knot `i` to the next.
+    /// The motion of each joint between knot `i` and the next.
     pub(crate) fn cubics(&self, i: usize) -> PerJoint<Cubic> {
         PerJoint::from_fn(self.knots[i].positions.len(), |j| Cubic::between(&self.knots[i], &self.knots[i + 1], j))
     }

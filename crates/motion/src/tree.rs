@@ -11,7 +11,7 @@ pub(crate) struct Tree {
     blocks: Vec<Block>,
     pub(crate) states: Vec<State>,
     pub(crate) parents: Vec<u32>,
-    /// Samples further away than this are not for the node (dynamic domain).
+    /// Samples farther away than this do not extend the node (dynamic domain).
     pub(crate) radii: Vec<f32>,
 }
 
@@ -24,7 +24,7 @@ impl Tree {
         self.states.len()
     }
 
-    /// A root is its own parent.
+    /// Adds a node; a root is its own parent.
     pub(crate) fn push(&mut self, state: State, parent: usize) -> usize {
         let index = self.states.len();
         if index.is_multiple_of(16) {
@@ -65,7 +65,7 @@ impl Tree {
         nearest
     }
 
-    /// From a node to its root.
+    /// The postures from a node to its root.
     pub(crate) fn branch(&self, mut node: usize) -> Vec<State> {
         let mut branch = vec![self.states[node]];
         while self.parents[node] as usize != node {

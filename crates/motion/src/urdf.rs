@@ -1,4 +1,4 @@
-//! Reading a robot's description: its links, parents first, what moves them, and the limits of its joints.
+//! Reads a URDF: its links, parents first, the joints that move them, and the limits of these.
 
 use crate::geometry::{Body, Geometry};
 use crate::mesh::{Mesh, MeshError, Meshed};
@@ -12,87 +12,87 @@ use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// A URDF that does not describe this kind of robot.
+/// Why a URDF does not describe this kind of robot.
 #[derive(Debug, thiserror::Error)]
 pub enum RobotError {
-    /// Not a URDF, and where.
+    /// The text is not a valid URDF, with the place of the error.
     #[error("the robot description is not valid URDF: {0}")]
     Fault(UrdfFault),
-    /// Not a URDF for another reason, without a place.
+    /// The text is not a valid URDF for another reason, without a place.
     #[error("the robot description is not valid URDF: {0}")]
     Urdf(String),
-    /// More than the pairs of them can be looked at.
+    /// There are more links than can be checked in pairs.
     #[error(
         "the robot description has {count} links: at most {MAX_LINKS} are supported; leave out those that do not matter for collisions"
     )]
     TooManyLinks {
-        /// How many.
+        /// Number of links.
         count: usize,
     },
-    /// A joint or link that must be there is not.
+    /// A required joint or link is missing.
     #[error("the robot description has no {what} `{name}`")]
     Missing {
-        /// Link or joint.
+        /// "link" or "joint".
         what: &'static str,
         /// Its name.
         name: String,
     },
-    /// Limits of a joint that mimics another, and that leave that one no position.
+    /// The limits of a mimic joint leave no position for the joint that it mimics.
     #[error(
         "the joint `{name}` mimics `{driver}`, but its limits {} to {} leave `{driver}` no position from {} to {}",
         limits[0], limits[1], driver_limits[0], driver_limits[1]
     )]
     Contradicts {
-        /// What mimics.
+        /// The mimic joint.
         name: String,
-        /// What is mimicked.
+        /// The joint that it mimics.
         driver: String,
-        /// Of the joint that mimics, as the description has them.
+        /// The limits of the mimic joint in the URDF.
         limits: [f64; 2],
-        /// Of the other, as far as they are narrowed by others.
+        /// The limits of the other joint, as narrowed by other mimic joints.
         driver_limits: [f64; 2],
     },
-    /// A joint that cannot be planned for.
+    /// A joint cannot be planned.
     #[error("the joint `{name}` cannot be planned for: {reason}")]
     NotPlannable {
         /// Its name.
         name: String,
-        /// Why not.
+        /// The reason.
         reason: String,
     },
-    /// A mesh that cannot be used.
+    /// A mesh cannot be used.
     #[error("the mesh `{file}` of link `{link}`: {error}")]
     Mesh {
         /// The link.
         link: String,
-        /// As the description names it.
+        /// Its file name in the URDF.
         file: String,
-        /// What is wrong.
+        /// The error.
         error: MeshError,
     },
-    /// Something this model does not support.
+    /// The URDF has something that this model does not support.
     #[error("{what} `{name}` of the robot description is not supported: {reason}")]
     Unsupported {
-        /// Link or joint.
+        /// "link" or "joint".
         what: &'static str,
         /// Its name.
         name: String,
-        /// Why not.
+        /// The reason.
         reason: &'static str,
     },
 }
 
-// Not by `#[from]`, which would make it a source that is said twice.
+// Without `#[from]`, which would make the fault a source and print it twice.
 impl From<UrdfFault> for RobotError {
     fn from(fault: UrdfFault) -> RobotError {
         RobotError::Fault(fault)
     }
 }
 
-/// What a text describes, and where it says so of its joints.
+/// Parses a URDF; also returns where its joints are in the text.
 ///
 /// # Errors
-/// [`RobotError::Fault`] names the line.
+/// [`RobotError::Fault`] gives the line.
 pub(crate) fn parse(text: &str) -> Result<(urdf_rs::Robot, BTreeMap<String, JointText>), RobotError> {
     let Checked { joints, has_empty_materials } = urdf_faults::check(text)?;
     let unread = |error: &dyn std::fmt::Display| RobotError::Urdf(error.to_string());
@@ -103,47 +103,47 @@ pub(crate) fn parse(text: &str) -> Result<(urdf_rs::Robot, BTreeMap<String, Join
     Ok((urdf_rs::read_from_string(&filled).map_err(|error| unread(&error))?, joints))
 }
 
-/// What a URDF describes.
+/// The content of a URDF.
 #[derive(Clone)]
 pub(crate) struct Description {
     pub(crate) name: String,
-    /// Those with a position of their own.
+    /// The joints that mimic no other.
     pub(crate) joints: Vec<Joint>,
-    /// Parents before children; each driven by the index of a joint.
+    /// Parents before children; a link's drive has the index of a joint.
     pub(crate) links: Vec<Link>,
-    /// The names of the joints that mimic others.
+    /// The names of the mimic joints.
     pub(crate) mimics: BTreeSet<String>,
-    /// Where the joints are in the text.
+    /// The places of the joints in the text.
     pub(crate) texts: BTreeMap<String, JointText>,
 }
 
-/// Where the one turn begins and ends that a joint without limits has for its range, in radians.
+/// The range of a joint without limits is one turn, from minus this to this, in radians.
 const ENDLESS_RAD: f64 = std::f64::consts::PI;
 
-/// A mesh of a link that is longer than this has its numbers in millimetres, unless a `scale` says that it has not.
+/// If a mesh is larger than this and has no `scale`, its unit is assumed to be millimetres, and it is refused.
 const PLAUSIBLE_M: f64 = 25.0;
 
-/// Links of a robot at the most: every pair of them is looked at in many postures.
+/// Maximum number of links of a robot: every pair of them is checked in many postures.
 const MAX_LINKS: usize = 1_024;
 
-/// Where a URDF names no acceleration, the speed is reached in this time, in seconds.
+/// Time in which the maximum velocity is reached, in seconds, if a URDF gives no acceleration.
 const TIME_TO_SPEED_S: f64 = 0.25;
 
-/// Where a URDF names no jerk, the full acceleration is reached in this time, in seconds.
+/// Time in which the maximum acceleration is reached, in seconds, if a URDF gives no jerk.
 const TIME_TO_ACCELERATION_S: f64 = 0.1;
 
-/// Reads a description; `load` gives what is in a mesh file.
+/// Reads a URDF; `load` returns the content of a mesh file.
 ///
 /// # Errors
-/// [`RobotError`] names the link or joint.
+/// [`RobotError`] gives the link or joint.
 pub(crate) fn read(text: &str, load: &mut Loader<'_>) -> Result<Description, RobotError> {
     described(parse(text)?, load)
 }
 
-/// Reads links and joints without any shapes: no mesh file is read for that.
+/// Reads links and joints without shapes: no mesh file is read.
 ///
 /// # Errors
-/// As [`read`], but for what is wrong with meshes.
+/// As [`read`], except those of meshes.
 pub(crate) fn read_outline(text: &str) -> Result<Description, RobotError> {
     let (mut urdf, texts) = parse(text)?;
     urdf.links.iter_mut().for_each(|link| link.collision.clear());
@@ -167,7 +167,7 @@ fn described(
             limits.narrow(joint, &followed)?;
         }
     }
-    // What mimics may not be where it was after a whole turn of what it follows.
+    // A mimic joint may be elsewhere after a whole turn of the joint that it mimics, so that joint is not treated as continuous.
     let followed: BTreeSet<&str> = urdf.joints.iter().filter_map(|j| Some(j.mimic.as_ref()?.joint.as_str())).collect();
     let turns_on = |j: &&urdf_rs::Joint| j.joint_type == urdf_rs::JointType::Continuous && !followed.contains(&*j.name);
     let endless: BTreeSet<&str> = urdf.joints.iter().filter(turns_on).map(|j| j.name.as_str()).collect();
@@ -178,7 +178,7 @@ fn described(
     Ok(Description { name: urdf.name, joints, links, mimics, texts })
 }
 
-/// What a description says of how a joint may move.
+/// The limits of a joint in a URDF.
 #[derive(Debug, Clone, Copy)]
 struct Limits {
     lower: f64,
@@ -198,8 +198,8 @@ impl Limits {
         Limits { lower, upper, velocity, acceleration, jerk }
     }
 
-    /// Leaves of these only what a joint that mimics this one can follow. A range that is empty or a single position says nothing: writers
-    /// leave it out, as what mimics has no position of its own.
+    /// Narrows these limits to positions that a mimic joint can follow. An empty range or one with a single position is ignored: some writers leave
+    /// the range out, because a mimic joint has no position of its own.
     fn narrow(&mut self, joint: &urdf_rs::Joint, followed: &Followed<'_>) -> Result<(), RobotError> {
         let Followed { driver, factor, offset } = *followed;
         if factor == 0.0 {
@@ -208,7 +208,7 @@ impl Limits {
         let own = Limits::of(joint);
         if joint.joint_type != urdf_rs::JointType::Continuous && own.lower < own.upper {
             let [a, b] = [own.lower, own.upper].map(|limit| (limit - offset) / factor);
-            // Adding zero takes the sign from a zero.
+            // Adding zero turns -0 into 0.
             let (lower, upper) = (self.lower.max(a.min(b)) + 0.0, self.upper.min(a.max(b)) + 0.0);
             if lower > upper {
                 let (name, driver) = (joint.name.clone(), driver.name.clone());
@@ -224,7 +224,7 @@ impl Limits {
         Ok(())
     }
 
-    /// A joint with these limits; what is not given is taken from what is.
+    /// A joint with these limits; missing ones are derived from the others.
     fn joint(&self, name: &str) -> Joint {
         let Limits { lower, upper, velocity, acceleration, jerk } = *self;
         let velocity = velocity.unwrap_or(1.0);
@@ -234,7 +234,7 @@ impl Limits {
     }
 }
 
-/// All links, breadth first from the root: parents come before children. They are one tree ([`urdf_faults`]).
+/// All links, breadth first from the root, so parents come before children. They are one tree ([`urdf_faults`]).
 fn links(urdf: &urdf_rs::Robot, joints: &[Joint], load: &mut Loader<'_>) -> Result<Vec<Link>, RobotError> {
     let named: BTreeMap<&str, &urdf_rs::Link> = urdf.links.iter().map(|link| (link.name.as_str(), link)).collect();
     let mut below: BTreeMap<&str, Vec<&urdf_rs::Joint>> = BTreeMap::new();
@@ -271,7 +271,7 @@ fn link(
     Ok(Link { bodies, meshes, spheres, ..Link::bare(&link.name, parent, origin, drive) })
 }
 
-/// Where a joint is, and what moves it.
+/// The pose of a joint in its parent link's frame, and its drive.
 fn drive(urdf: &urdf_rs::Robot, joints: &[Joint], joint: &urdf_rs::Joint) -> Result<(Pose, Option<Drive>), RobotError> {
     let origin = origin(&joint.origin);
     let unsupported = |reason| RobotError::Unsupported { what: "joint", name: joint.name.clone(), reason };
@@ -293,14 +293,14 @@ fn drive(urdf: &urdf_rs::Robot, joints: &[Joint], joint: &urdf_rs::Joint) -> Res
     Ok((origin, index.map(|joint| Drive { joint, factor, ..still })))
 }
 
-/// What a joint's position is made of: that of a joint that mimics none, times a factor, and an offset.
+/// A joint's position as that of the joint at the end of its mimic chain, times a factor, plus an offset.
 struct Followed<'u> {
     driver: &'u urdf_rs::Joint,
     factor: f64,
     offset: f64,
 }
 
-/// Follows mimics to the joint at the end of their chain.
+/// Follows a chain of mimic joints to its end.
 fn followed<'u>(urdf: &'u urdf_rs::Robot, joint: &'u urdf_rs::Joint) -> Result<Followed<'u>, RobotError> {
     let mut followed = Followed { driver: joint, factor: 1.0, offset: 0.0 };
     for _ in 0..=urdf.joints.len() {
@@ -314,7 +314,7 @@ fn followed<'u>(urdf: &'u urdf_rs::Robot, joint: &'u urdf_rs::Joint) -> Result<F
     Err(RobotError::Unsupported { what: "joint", name: joint.name.clone(), reason })
 }
 
-/// The primitives and the meshes of a link; `load` gives what is in the file of a name.
+/// The primitives and the meshes of a link; `load` returns the content of a file.
 fn shapes(link: &urdf_rs::Link, load: &mut Loader<'_>) -> Result<(Vec<Body>, Vec<Meshed>), RobotError> {
     let (mut bodies, mut meshes) = (Vec::new(), Vec::new());
     for collision in &link.collision {
@@ -334,7 +334,7 @@ fn shapes(link: &urdf_rs::Link, load: &mut Loader<'_>) -> Result<(Vec<Body>, Vec
     Ok((bodies, meshes))
 }
 
-/// What is in a mesh file.
+/// Returns the content of a mesh file.
 pub(crate) type Loader<'l> = dyn FnMut(&str) -> Result<Vec<u8>, MeshError> + 'l;
 
 pub(crate) fn primitive(geometry: &urdf_rs::Geometry) -> Option<Geometry> {

@@ -1,6 +1,5 @@
-//! What is wrong with the text of a URDF, and where: the line of an element that is not closed, an attribute that is missing, a number that is
-//! none or that no robot can have, limits that contradict themselves, links that are not one tree (`urdf_tree`). The reader of the whole description ([`urdf_rs`])
-//! loses the lines.
+//! Finds errors in the text of a URDF, with their place: elements that are not closed, missing attributes, invalid numbers, contradictory limits,
+//! links that are not one tree (`urdf_tree`). The reader of the whole description ([`urdf_rs`]) does not keep the lines.
 
 use crate::urdf_tree::{JointText, Place, Tree};
 use crate::xml_text;
@@ -9,47 +8,47 @@ use xml::attribute::OwnedAttribute;
 use xml::common::Position;
 use xml::reader::XmlEvent;
 
-/// The first thing that is wrong with a URDF.
+/// The first error in a URDF.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}, column {column}: {reason}")]
 pub struct UrdfFault {
-    /// Of the text, from 1.
+    /// The line, from 1.
     pub line: u64,
-    /// From 1.
+    /// The column, from 1.
     pub column: u64,
-    /// What is wrong there.
+    /// The error.
     pub reason: String,
 }
 
-/// What the value of an attribute must be. So many numbers are separated by blanks.
+/// The expected value of an attribute. The count is the number of values, separated by blanks.
 #[derive(Debug, Clone, Copy)]
 enum Value {
     Text,
-    /// Lengths, angles and parts of directions.
+    /// Lengths, angles and direction vectors.
     Numbers(usize),
     /// Sizes, in metres.
     Sizes(usize),
     /// Factors along x, y and z.
     Scale,
-    /// How large or how fast at the most, infinite where it is not limited; 0 where it is not known.
+    /// A maximum of size or speed; infinite for no limit, 0 for unknown.
     Most,
     /// A position.
     Limit,
-    /// A number that is held against no other: it is read, and nothing here is computed from it.
+    /// A number that is parsed, but not used.
     Unused,
-    /// Red, green, blue and opacity: of what is beyond 0 to 1, or no number, whoever shows it makes something that is.
+    /// Red, green, blue and opacity; values outside of 0 to 1, or NaN, are corrected when they are shown.
     Colour,
 }
 
 use Value::{Colour, Limit, Most, Numbers, Scale, Sizes, Text, Unused};
 
-/// Places and sizes beyond this are not in metres. Shapes are computed in single precision, which has no room for much more.
+/// Maximum position and size: larger ones are not in metres. Shapes are computed in single precision, which allows for little more.
 const FARTHEST: f64 = 1e6;
 
-/// An axis shorter than this points nowhere.
+/// Minimum length of an axis.
 const SHORTEST_AXIS: f64 = 1e-9;
 
-/// Attributes of the elements that are read, the element that holds them, and whether they must be there.
+/// The checked attributes: the parent element, the element, the attribute, its value, and whether it is required.
 const ATTRIBUTES: &[(&str, &str, &str, Value, bool)] = &[
     ("", "robot", "name", Text, true),
     ("robot", "link", "name", Text, true),
@@ -97,22 +96,22 @@ const ATTRIBUTES: &[(&str, &str, &str, Value, bool)] = &[
     ("material", "color", "rgba", Colour, false),
 ];
 
-/// What a text without a fault says.
+/// The result for a text without errors.
 #[derive(Debug, Default)]
 pub(crate) struct Checked {
-    /// What it says of its joints.
+    /// The places of its joints.
     pub(crate) joints: BTreeMap<String, JointText>,
-    /// Whether there is what [`is_empty_material`] finds.
+    /// Whether [`is_empty_material`] is true for any element.
     pub(crate) has_empty_materials: bool,
 }
 
-/// Whether an element is a colour or a texture that names none: it says nothing, and other readers of URDF pass over it.
+/// Whether an element is a colour or a texture without a value: it has no meaning, and other URDF readers ignore it.
 pub(crate) fn is_empty_material(parent: &str, element: &str, attributes: &[OwnedAttribute]) -> bool {
     let lacks = |key: &str| !attributes.iter().any(|attribute| attribute.name.local_name == key);
     parent == "material" && (element == "texture" && lacks("filename") || element == "color" && lacks("rgba"))
 }
 
-/// What is not XML, and what to do where that is known.
+/// The message for a text that is not XML, with advice for a known error.
 fn not_xml(message: &str) -> String {
     match message.strip_suffix(" prefix is unbound").and_then(|name| name.split_once(' ')) {
         Some((_, name)) => {
@@ -126,17 +125,17 @@ fn not_xml(message: &str) -> String {
     }
 }
 
-/// The types of joints that there are.
+/// The types of joints in URDF.
 const TYPES: [&str; 7] = ["revolute", "continuous", "prismatic", "fixed", "floating", "planar", "spherical"];
 
-/// Looks for the first fault; without one, what the text says.
+/// Finds the first error; without one, returns the result.
 ///
 /// # Errors
 /// [`UrdfFault`].
 pub(crate) fn check(text: &str) -> Result<Checked, UrdfFault> {
     let mut reader = xml_text::reader(text.as_bytes());
     let (mut open, mut tree, mut has_limits): (Vec<String>, _, _) = (Vec::new(), Tree::default(), false);
-    // Of the link or joint that is being read, its name, and of a joint whether it moves.
+    // The name of the current link or joint, and whether a joint moves.
     let (mut named, mut moves) = (String::new(), false);
     let mut has_empty_materials = false;
     loop {
@@ -214,7 +213,7 @@ pub(crate) fn check(text: &str) -> Result<Checked, UrdfFault> {
     }
 }
 
-/// What is wrong with an attribute, and what to write instead.
+/// The error in an attribute, if any, with advice.
 fn wrong(element: &str, key: &str, found: Option<&str>, value: Value, needed: bool) -> Option<String> {
     let Some(text) = found else { return needed.then(|| format!("`{element}` has no attribute `{key}`")) };
     let count = match value {
@@ -258,7 +257,7 @@ fn points(xyz: &str) -> bool {
     square.sqrt() > SHORTEST_AXIS
 }
 
-/// What is wrong with a range; where one end is not given it is 0.
+/// The error in a range, if any; a missing end is 0.
 fn contradiction(lower: &str, upper: &str) -> Option<String> {
     let [lower, upper] = [lower, upper].map(|text| text.trim().parse().unwrap_or(0.0));
     if lower > upper {

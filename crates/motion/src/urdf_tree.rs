@@ -1,13 +1,13 @@
-//! Which links of a URDF hang on which, before anything else is read: every name once, every reference to a link or joint that is there, and one
-//! tree that holds all links.
+//! Checks the links and joints of a URDF before anything else is read: every name is unique, every reference is to an existing link or joint, and one
+//! tree contains all links.
 //!
-//! What breaks this is refused with its line. A reader that went on would leave out what hangs on no tree with the root.
+//! A violation is refused with its line. A reader that continued would lose the links that are not connected to the root.
 
 use crate::urdf_faults::UrdfFault;
 use ratn_model::load::suggestion;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Where something stands in the text.
+/// A place in the text.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Place {
     pub(crate) line: u64,
@@ -20,7 +20,7 @@ impl Place {
     }
 }
 
-/// A joint's end: a link, and where the joint names it.
+/// An end of a joint: a link, and the place of the reference.
 type End = (String, Place);
 
 #[derive(Debug)]
@@ -28,18 +28,18 @@ struct Joint {
     name: String,
     parent: Option<End>,
     child: Option<End>,
-    /// The joint that it follows, and where it names that.
+    /// The joint that it mimics, and the place of the reference.
     follows: Option<End>,
     at: Place,
     has_limit: bool,
 }
 
-/// Where a joint begins in the text, and whether its limits are there.
+/// Where a joint begins in the text, and whether it has limits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct JointText {
     /// From 1.
     pub(crate) line: u64,
-    /// It has an element `limit`.
+    /// Whether it has an element `limit`.
     pub(crate) has_limit: bool,
 }
 
@@ -48,7 +48,7 @@ pub(crate) struct JointText {
 pub(crate) struct Tree {
     links: Vec<End>,
     joints: Vec<Joint>,
-    /// Where each name is, of links and of joints.
+    /// The place of each name, for links and for joints.
     link_places: BTreeMap<String, Place>,
     joint_places: BTreeMap<String, Place>,
 }
@@ -57,23 +57,23 @@ impl Tree {
     /// Adds a link.
     ///
     /// # Errors
-    /// [`UrdfFault`] where there is one with this name.
+    /// [`UrdfFault`] if there is one with this name.
     pub(crate) fn link(&mut self, name: &str, at: Place) -> Result<(), UrdfFault> {
         self.links.push((name.to_owned(), at));
         is_first(&mut self.link_places, "link", name, at)
     }
 
-    /// Adds a joint, of which the ends are not known yet.
+    /// Adds a joint; its ends are not known yet.
     ///
     /// # Errors
-    /// [`UrdfFault`] where there is one with this name.
+    /// [`UrdfFault`] if there is one with this name.
     pub(crate) fn joint(&mut self, name: &str, at: Place) -> Result<(), UrdfFault> {
         let (parent, child, follows) = (None, None, None);
         self.joints.push(Joint { name: name.to_owned(), parent, child, follows, at, has_limit: false });
         is_first(&mut self.joint_places, "joint", name, at)
     }
 
-    /// Sets an end of the joint that was added last: its `parent` or its `child`.
+    /// Sets an end of the last joint: its `parent` or its `child`.
     pub(crate) fn end(&mut self, which: &str, link: &str, at: Place) {
         if let Some(joint) = self.joints.last_mut() {
             let end = if which == "parent" { &mut joint.parent } else { &mut joint.child };
@@ -81,35 +81,35 @@ impl Tree {
         }
     }
 
-    /// The joint that was added last follows another one.
+    /// Records that the last joint mimics another one.
     pub(crate) fn follows(&mut self, joint: &str, at: Place) {
         if let Some(last) = self.joints.last_mut() {
             last.follows = Some((joint.to_owned(), at));
         }
     }
 
-    /// The joint that was added last has limits.
+    /// Records that the last joint has limits.
     pub(crate) fn limited(&mut self) {
         if let Some(last) = self.joints.last_mut() {
             last.has_limit = true;
         }
     }
 
-    /// What was read of the joints, by their names.
+    /// The places of the joints, by name.
     pub(crate) fn joints(self) -> BTreeMap<String, JointText> {
         let text = |joint: Joint| (joint.name, JointText { line: joint.at.line, has_limit: joint.has_limit });
         self.joints.into_iter().map(text).collect()
     }
 
-    /// The name of the joint that was added last.
+    /// The name of the last joint.
     pub(crate) fn last_joint(&self) -> &str {
         self.joints.last().map_or("", |joint| &joint.name)
     }
 
-    /// Whether all links are one tree.
+    /// Checks that all links are one tree.
     ///
     /// # Errors
-    /// [`UrdfFault`] names the link or joint that is not part of it, and the likely cause.
+    /// [`UrdfFault`] gives the link or joint that is not part of it, and the likely cause.
     pub(crate) fn check(&self) -> Result<(), UrdfFault> {
         let mut parents: BTreeMap<&str, (&Joint, Place)> = BTreeMap::new();
         for joint in &self.joints {
@@ -154,7 +154,7 @@ impl Tree {
         let (mut reached, mut open) = (BTreeSet::from([root.as_str()]), vec![root.as_str()]);
         while let Some(link) = open.pop() {
             let below = children.get(link).into_iter().flatten();
-            // Each has one parent, so none comes twice.
+            // Each link has one parent, so none is reached twice.
             below.for_each(|child| {
                 reached.insert(child);
                 open.push(child);

@@ -1,11 +1,11 @@
-//! Motions whose tool goes in straight lines all the way, through way points: nothing is searched, so it is that way or an error.
+//! Motions whose tool moves in straight lines all the way, through way points: nothing is searched, so the result is this motion or an error.
 //!
 //! ```text
 //! start ─ depart ─ straight ─ way point ─ straight ─ … ─ straight ─ approach ─ goal
 //! ```
 //!
-//! The arm follows from posture to posture (`line`). Between the departure and the approach nothing touches anything. Where the way bends
-//! sharply the arm stops, unless the corners may be rounded. Of several goals the first is taken that the tool gets to.
+//! Each posture is solved from the one before (`line`). Between the departure and the approach nothing may be touched. At sharp corners the arm
+//! stops, unless they may be rounded. Of several goals the first reachable one is used.
 
 use crate::collision::{Checker, Contact, length};
 use crate::constrained::Constraint;
@@ -18,7 +18,7 @@ use crate::space::state;
 use ratn_model::pose::Pose;
 use ratn_world::scene::Scene;
 
-/// The most way points of one motion.
+/// Maximum number of way points of one motion.
 pub const MAX_WAY_POINTS: usize = 256;
 
 /// The largest `blend_m`, in metres.
@@ -27,14 +27,14 @@ pub const MAX_BLEND_M: f64 = 0.5;
 /// Poses that the tool passes in straight lines on its way to the goal.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct WayPoints {
-    /// Of the tool in the world frame; none: straight to the goal.
+    /// Poses of the tool in the world frame; if empty, straight to the goal.
     pub through: Vec<Pose>,
-    /// How far from each of them the tool may leave the lines, so that it need not stop, in metres.
+    /// How far from each of them the tool may deviate from the lines, so that it need not stop, in metres.
     pub blend_m: f64,
 }
 
 impl WayPoints {
-    /// Refuses what makes no sense.
+    /// Refuses invalid values.
     pub(crate) fn check(&self, goals: &[Goal]) -> Result<(), PlanError> {
         let malformed = |what: &str, value: String, expected: String| {
             Err(PlanError::Malformed { what: what.to_owned(), value, expected })
@@ -62,37 +62,37 @@ impl WayPoints {
     }
 }
 
-/// What a straight way is followed and checked with.
+/// The inputs for following and checking a straight motion.
 pub(crate) struct Follower<'p, 'a> {
     pub(crate) scene: &'p Scene,
-    /// The tool, in the frame of the base, which is at `base`.
+    /// The inverse kinematics of the tool, in the frame of the base, whose pose is `base`.
     pub(crate) reach: &'p Reach,
     pub(crate) base: Pose,
     pub(crate) checker: &'p mut Checker<'a>,
-    /// How the tool leaves a goal where it lets go.
+    /// Checks how the tool leaves a goal at which it releases an object.
     pub(crate) leaving: Option<&'p mut Checker<'a>>,
     pub(crate) constraint: Option<&'p Constraint>,
-    /// How deep an approach may press into what it touches, in the order in which it is tried.
+    /// Allowed depths of an approach in the object that it touches, in metres, in the order in which they are tried.
     pub(crate) presses_m: Vec<f64>,
 }
 
-/// A way that was followed to its end.
+/// A complete straight motion.
 pub(crate) struct Followed {
-    /// From the end of the departure to the beginning of the approach.
+    /// The postures from the end of the departure to the beginning of the approach.
     pub(crate) lines: Vec<JointVector>,
-    /// To the goal; at least one posture.
+    /// The postures to the goal; at least one.
     pub(crate) approach: Vec<JointVector>,
 }
 
 impl Followed {
-    /// In joint space.
+    /// The length in joint space.
     pub(crate) fn length_rad(&self) -> f64 {
         length(&self.lines) + length(&self.approach)
     }
 }
 
 impl Follower<'_, '_> {
-    /// From a posture to the first goal that the tool gets to in straight lines.
+    /// The motion from a posture to the first goal that the tool reaches in straight lines.
     pub(crate) fn follow(
         &mut self,
         start: &JointVector,
@@ -102,7 +102,7 @@ impl Follower<'_, '_> {
     ) -> Result<Followed, PlanError> {
         let mut reasons = Vec::new();
         for goal in &request.goals {
-            // Others have been refused.
+            // Other kinds of goals have been refused.
             let Goal::Pose(goal) = goal else { continue };
             match self.to(start, &self.base.inverse().compose(goal), request, way, pace)? {
                 Ok(followed) => return Ok(followed),
@@ -137,7 +137,7 @@ impl Follower<'_, '_> {
             return Ok(Ok(Followed { approach: vec![last], lines }));
         }
         let lines_in = Lines::new(entry, &[*goal], 0.0);
-        // What presses least is looked for along the way that is found; one that presses too deep is none.
+        // The smallest depth is determined afterwards, along the resulting approach; deeper than the largest one is not allowed.
         let contact = Contact::Gripper(self.presses_m.last().copied().unwrap_or_default());
         let (checker, mut leaving) = (&mut *self.checker, self.leaving.as_deref_mut());
         let is_free = &mut |from: &JointVector, to: &JointVector| {
@@ -160,14 +160,14 @@ impl Follower<'_, '_> {
         })
     }
 
-    /// What the tool does not keep on an approach.
+    /// How an approach violates the constraint on the tool, if it does.
     fn broken(&self, approach: &[JointVector]) -> Option<String> {
         let constraint = self.constraint?;
         let breaks = |pair: &&[JointVector]| !constraint.holds_along(&state(&pair[0]), &state(&pair[1]));
         approach.windows(2).find(breaks).map(|pair| constraint.breach(&state(&pair[1])))
     }
 
-    /// What is in the way of an approach that presses as little as it can.
+    /// Tries the allowed depths in order; returns the collision of the approach if it is free at none of them.
     fn pressed(&mut self, approach: &[JointVector]) -> Option<String> {
         let mut reason = None;
         for press_m in &self.presses_m {
@@ -182,7 +182,7 @@ impl Follower<'_, '_> {
     }
 }
 
-/// What is in the way of a straight motion of the joints.
+/// What blocks a straight motion of the joints.
 fn free(
     checker: &mut Checker<'_>,
     constraint: Option<&Constraint>,
@@ -198,7 +198,7 @@ fn free(
     }
 }
 
-/// How far the tool gets, and why no further.
+/// The error message: how far the tool gets, and the cause.
 fn said(traced: &Traced, way: &WayPoints, cause: &Cause) -> String {
     let (reached_m, wanted_m) = (traced.along_m[traced.along_m.len() - 1], traced.wanted_m);
     let whither = match traced.whither < way.through.len() {

@@ -1,32 +1,32 @@
-//! Where a robot fetches boxes: a table, a region of it on which they stand, and the places that they are brought to.
+//! The workplace of a robot: a table, the region of it where boxes stand, and the places to which they are brought.
 //!
-//! It is the `[workplace]` of a `robot.toml` and what a cell is furnished with; planner and detector do not need it.
-//! Metres and radians in the world frame; places on the base are seen from the base.
+//! This is `[workplace]` of a `robot.toml` and defines the furniture of a cell; planner and detector do not need it. Metres and radians in the world
+//! frame; places on the base are in the base's frame.
 
 use crate::robot::Robot;
 use crate::tableware::Tableware;
 use ratn_model::pose::Pose;
 use serde::Deserialize;
 
-/// The most places.
+/// Maximum number of places.
 pub const MAX_PLACES: usize = 9;
-/// How far a place on the table may be above or below the table's top, in metres.
+/// Maximum height of a place on the table above or below the table's top, in metres.
 const LEVEL_M: f64 = 0.001;
 
-/// See the module.
+/// See the module's description.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Workplace {
     /// The table's top.
     pub table: Slab,
-    /// The boxes on it: those of the first arm.
+    /// The boxes of the first arm, on the table.
     pub boxes: Boxes,
-    /// Where they are brought to.
+    /// The places to which these boxes are brought.
     pub places: Places,
-    /// What further arms have of their own.
+    /// The boxes and places of further arms.
     #[serde(default, rename = "other_arm")]
     pub others: Vec<Share>,
-    /// The part of the table into which several arms reach, one at a time.
+    /// The part of the table that several arms can reach, one at a time.
     #[serde(default)]
     pub middle: Option<Middle>,
     /// The rack and the places of tableware, for the scene `table` of a cell.
@@ -34,7 +34,7 @@ pub struct Workplace {
     pub tableware: Option<Tableware>,
 }
 
-/// What a further arm fetches, and whereto.
+/// The boxes of a further arm and their places.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Share {
@@ -42,15 +42,15 @@ pub struct Share {
     pub arm: String,
     /// Its boxes.
     pub boxes: Boxes,
-    /// Where it brings them.
+    /// The places to which it brings them.
     pub places: Places,
 }
 
-/// A strip of the table that belongs to nobody. A cell offers it as a resource: who goes there holds that.
+/// A strip of the table that is shared by the arms. A cell offers it as a resource, which has to be held to move there.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Middle {
-    /// From which y to which.
+    /// Minimum and maximum y.
     pub y: [f64; 2],
 }
 
@@ -58,46 +58,46 @@ pub struct Middle {
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Slab {
-    /// Its centre.
+    /// The position of its centre.
     pub centre: [f64; 3],
-    /// Its edges.
+    /// Its edge lengths.
     pub size: [f64; 3],
 }
 
-/// Where boxes stand, and how large they are.
+/// The region and the sizes of boxes.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Boxes {
-    /// Least and greatest x of their centres.
+    /// Minimum and maximum x of their centres.
     pub x: [f64; 2],
-    /// Least and greatest y.
+    /// Minimum and maximum y.
     pub y: [f64; 2],
-    /// Least edges: longer horizontal, shorter horizontal, height.
+    /// Minimum edges: longer horizontal, shorter horizontal, height.
     pub least: [f64; 3],
-    /// Greatest edges.
+    /// Maximum edges.
     pub greatest: [f64; 3],
 }
 
-/// Places for a box each.
+/// Places for one box each.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Places {
-    /// On what.
+    /// The surface.
     pub on: Surface,
-    /// How a box's longer edge lies there, from the x axis.
+    /// The angle of a box's longer edge from the x axis, in radians.
     #[serde(default)]
     pub yaw: f64,
-    /// Points on that surface.
+    /// The points on that surface.
     pub at: Vec<[f64; 3]>,
 }
 
-/// What places are on.
+/// The surface of places.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Surface {
     /// The table.
     Table,
-    /// The robot's base, which carries them away.
+    /// The robot's base, which carries the boxes.
     Base,
 }
 
@@ -113,20 +113,20 @@ impl Slab {
 }
 
 impl Places {
-    /// As poses: on the surface, x along a box's longer edge.
+    /// The poses of the places: on the surface, x along a box's longer edge.
     pub fn poses(&self) -> Vec<Pose> {
         self.at.iter().map(|at| Pose::from_rpy(*at, 0.0, 0.0, self.yaw)).collect()
     }
 }
 
 impl Workplace {
-    /// The boxes and the places of every arm that has some, the first arm's first.
+    /// The boxes and places of every arm that has any, the first arm's first.
     pub fn shares(&self) -> impl Iterator<Item = (&Boxes, &Places)> {
         let others = self.others.iter().map(|share| (&share.boxes, &share.places));
         std::iter::once((&self.boxes, &self.places)).chain(others)
     }
 
-    /// What is wrong with it for this robot, if anything.
+    /// The error in it for this robot, if any.
     pub(crate) fn fault(&self, robot: &Robot) -> Option<String> {
         let Workplace { table, tableware, others, middle, .. } = self;
         if !positive(&table.size) || table.centre.iter().any(|c| !c.is_finite()) {
@@ -164,7 +164,7 @@ fn positive(size: &[f64; 3]) -> bool {
     size.iter().all(|edge| edge.is_finite() && *edge > 0.0)
 }
 
-/// What is wrong with the boxes and places of the arm from which the robot is seen, if anything.
+/// The error in the boxes and places of the arm from which the robot is seen, if any.
 fn share_fault(robot: &Robot, table: &Slab, boxes: &Boxes, places: &Places) -> Option<String> {
     let corners = [(0, 0), (0, 1), (1, 0), (1, 1)].map(|(i, j)| (boxes.x[i], boxes.y[j]));
     let opening = 2.0 * robot.open_finger_m();
@@ -197,5 +197,5 @@ fn share_fault(robot: &Robot, table: &Slab, boxes: &Boxes, places: &Places) -> O
     }
 }
 
-/// The posture that a robot begins in.
+/// The name of the robot's initial posture.
 pub const HOME: &str = "home";

@@ -1,25 +1,25 @@
-//! How all files of XML are opened: without entities of their own, which make a small file a large text.
+//! Opens all XML files: without custom entities, by which a small file can expand to a large text.
 
 use xml::attribute::OwnedAttribute;
 use xml::reader::{EventReader, ParserConfig2, XmlEvent};
 use xml::writer::EmitterConfig;
 
-/// What is said of a file with a document type.
+/// The error for a file with a document type.
 pub(crate) const NO_DOCUMENT_TYPE: &str =
     "it has a document type (`<!DOCTYPE`), whose entities are not supported: remove it";
 
-/// The longest attribute, in bytes: those of the outermost element are read before its document type is refused.
+/// Maximum length of an attribute, in bytes: the attributes of the outermost element are read before its document type is refused.
 const LONGEST_ATTRIBUTE: usize = 1 << 20;
 
-/// A reader of the text. Whoever uses it refuses a [`doctype`](EventReader::doctype) at the first element: [`NO_DOCUMENT_TYPE`].
+/// A reader of the text. The caller has to refuse a [`doctype`](EventReader::doctype) at the first element: [`NO_DOCUMENT_TYPE`].
 pub(crate) fn reader(text: &[u8]) -> EventReader<&[u8]> {
     EventReader::new_with_config(text, ParserConfig2::new().max_attribute_length(LONGEST_ATTRIBUTE))
 }
 
-/// The text without the elements, and all that is in them, of which `is_left_out` says so by the element that holds them, their name and their attributes.
+/// The text without the elements, with their content, for which `is_left_out` is true by parent element, name and attributes.
 ///
 /// # Errors
-/// What is not XML, and where.
+/// The place where the text is not XML.
 pub(crate) fn without(
     text: &str,
     is_left_out: impl Fn(&str, &str, &[OwnedAttribute]) -> bool,

@@ -1,4 +1,4 @@
-//! What a module is doing, and where that has brought it at a moment.
+//! What a module is doing, and its state at a given time.
 
 use super::arms::FIRST;
 use super::braking::Way;
@@ -12,21 +12,21 @@ use ratn_perception::camera::Camera;
 use serde::{Deserialize, Serialize};
 use std::time::Duration;
 
-/// A goal under way, as its giver named it.
+/// A goal that is being performed, by the number that its sender chose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Ticket(pub u64);
 
-/// A module of the robot. Each does one thing at a time.
+/// A module of the robot. Each performs one activity at a time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Module {
-    /// What everything else stands on.
+    /// The base, which carries everything else.
     Base,
     /// The joints of an arm, by the arm's number.
     Arm(usize),
     /// The two fingers of an arm, by the arm's number.
     Gripper(usize),
-    /// The camera's head.
+    /// The head with the camera.
     PanTilt,
     /// The camera.
     Camera,
@@ -53,11 +53,11 @@ pub(crate) enum Kind {
 }
 
 impl Module {
-    /// Those of a robot with one arm and everything else.
+    /// The modules of a robot with one arm, a gripper, a base, a head and a camera.
     pub const ALL: [Module; 5] =
         [Module::Base, Module::Arm(FIRST), Module::Gripper(FIRST), Module::PanTilt, Module::Camera];
 
-    /// Those that a robot has.
+    /// The modules of a robot.
     pub fn of(robot: &Robot) -> Vec<Module> {
         let arms = 0..robot.arm_names().count();
         let grippers = arms.clone().filter(|arm| !robot.finger_links_of(*arm).is_empty());
@@ -72,7 +72,7 @@ impl Module {
             .collect()
     }
 
-    /// The number of the arm that it is, or whose gripper it is.
+    /// The number of the arm that this module is, or whose gripper it is.
     pub fn arm(self) -> Option<usize> {
         match self {
             Module::Arm(arm) | Module::Gripper(arm) => Some(arm),
@@ -80,13 +80,13 @@ impl Module {
         }
     }
 
-    /// The name of the arm that it is, or whose gripper it is, of a robot with several arms: its resource says it as the attribute `arm`.
+    /// The name of the arm that this module is, or whose gripper it is, for a robot with several arms: the attribute `arm` of its resource.
     pub fn arm_name(self, robot: &Robot) -> Option<&str> {
         let arm = self.arm().filter(|_| robot.arm_names().count() > 1)?;
         robot.arm_names().nth(arm)
     }
 
-    /// The kind of the resource that it is.
+    /// The kind of the module's resource.
     pub fn kind(self) -> &'static str {
         match self {
             Module::Base => "Base",
@@ -99,12 +99,12 @@ impl Module {
 }
 
 impl Activity {
-    /// The time since it started.
+    /// Seconds since the activity started.
     pub(crate) fn elapsed_s(&self, now: Timestamp) -> f64 {
         now.since(self.started).as_secs_f64()
     }
 
-    /// How well it has followed a trajectory so far, if it follows one.
+    /// The tracking errors so far, if the activity follows a trajectory.
     pub(crate) fn tracking(&self, now: Timestamp) -> Option<Tracking> {
         match &self.kind {
             Kind::Follow(way) => Some(way.tracking(self.elapsed_s(now))),
@@ -112,13 +112,13 @@ impl Activity {
         }
     }
 
-    /// How much of its time has passed, 0 to 1.
+    /// The share of the activity's time that has passed, 0 to 1.
     fn fraction(&self, now: Timestamp) -> f64 {
         let whole = self.ends.since(self.started).as_secs_f64();
         if whole > 0.0 { (self.elapsed_s(now) / whole).clamp(0.0, 1.0) } else { 1.0 }
     }
 
-    /// Where the base is, if it moves the base: x, y and heading.
+    /// x, y and heading of the base, if the activity moves the base.
     pub(crate) fn base(&self, now: Timestamp) -> Option<[f64; 3]> {
         match &self.kind {
             Kind::Follow(Way::Base(motion)) => {
@@ -129,7 +129,7 @@ impl Activity {
         }
     }
 
-    /// Where the arm is, if it moves the arm.
+    /// The positions of the arm's joints, if the activity moves the arm.
     pub(crate) fn arm(&self, now: Timestamp) -> Option<JointVector> {
         match &self.kind {
             Kind::Follow(Way::Arm(_, motion)) => Some(motion.at(self.elapsed_s(now))),
@@ -137,7 +137,7 @@ impl Activity {
         }
     }
 
-    /// How far each finger is from the middle, if it moves the fingers.
+    /// Distance of each finger from the middle, if the activity moves the fingers.
     pub(crate) fn finger(&self, now: Timestamp) -> Option<f64> {
         let fraction = self.fraction(now);
         match &self.kind {
@@ -146,7 +146,7 @@ impl Activity {
         }
     }
 
-    /// Pan and tilt, if it moves the head.
+    /// Pan and tilt, if the activity moves the head.
     pub(crate) fn head(&self, now: Timestamp) -> Option<[f64; 2]> {
         let fraction = self.fraction(now);
         // A smooth start and stop.
@@ -158,7 +158,7 @@ impl Activity {
     }
 }
 
-/// Seconds of the robot as a duration; negative and NaN count as none, and what no duration can hold as the longest.
+/// Seconds of the robot as a duration; negative values and NaN give zero, values too large for a duration give the longest one.
 pub(crate) fn seconds(s: f64) -> Duration {
     Duration::try_from_secs_f64(s.max(0.0)).unwrap_or(Duration::MAX)
 }

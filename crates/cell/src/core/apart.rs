@@ -1,9 +1,10 @@
-//! What the parts of a robot keep from each other: an arm that sets out, fingers that begin to close or to open, and a head that begins to turn
-//! are compared with every other arm, where it stands and on the way that it has before it, and with a head that turns (`clearance`); fingers also
-//! with their own robot and a head that stands. Of an arm that sets out, those are a matter of the check of its trajectory.
+//! Minimum distances between the parts of a robot. When an arm starts a motion, fingers begin to close or open, or the head begins to turn, the part
+//! is compared with every other arm, at its current posture and along the rest of its motion, and with a turning head (`clearance`). Fingers are
+//! also compared with their own robot and with a standing head; for an arm that starts a motion, the check of its trajectory covers those.
 //!
-//! The fingers of an arm count where they are, where they are on their way to, and open: whoever holds that arm may open them. That is so of both of
-//! two arms on their ways, and fingers on their way keep as far from another part on its way as arms do: so it does not matter which begins first.
+//! For the fingers of an arm, three positions count: the current one, the one that they move to, and open, because the holder of the arm's lease
+//! may open them. This holds for both of two moving arms, and moving fingers keep the same distance from another moving part as arms do. So the result does
+//! not depend on which part begins first.
 
 use super::activity::{Kind, Module, Ticket};
 use super::braking::Way;
@@ -16,26 +17,25 @@ use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{ArmPosition, Configuration};
 use ratn_world::scene::Scene;
 
-/// How far a finger may be from one position to the next that are compared, in metres.
+/// Maximum distance between two finger positions that are compared, in metres.
 const FINGER_STEP_M: f64 = 0.002;
-/// The same where the arm moves meanwhile, beside another part on its way: every position of the fingers comes with every one of the joints. No finger
-/// is as thin as that.
+/// The same where every finger position is combined with every posture of the moving joints. Every finger is thicker than this.
 const OPENING_STEP_M: f64 = 0.008;
-/// How many positions of fingers with positions of joints are looked at beside a part that stands, before the fingers' are looked at more coarsely.
+/// Maximum number of combined finger positions and joint postures compared with a standing part at the fine step; beyond it, the coarse step is used.
 const MAX_POSTURES_BESIDE: usize = 10 * MAX_POSTURES;
-/// How far a joint of the head may be from one position to the next, in radians.
+/// Maximum change of a head joint between two compared positions, in radians.
 const HEAD_STEP_RAD: f64 = 0.01;
 
-/// What a part will do, as it is compared with others.
+/// The future motion of a part, for comparison with others.
 struct Ours {
-    /// With those that are on their way.
+    /// For comparison with moving parts.
     beside_moving: Ahead,
-    /// With those that stand.
+    /// For comparison with standing parts.
     beside_standing: Ahead,
 }
 
 impl Ours {
-    /// The same beside all.
+    /// The same for moving and standing parts.
     fn alike(ahead: Ahead) -> Ours {
         Ours { beside_moving: ahead.clone(), beside_standing: ahead }
     }
@@ -48,16 +48,16 @@ impl Ours {
     }
 }
 
-/// What another part does.
+/// The future motion of another part.
 struct Theirs {
     ahead: Ahead,
     does: Other,
-    /// The goal with which it is on its way.
+    /// The goal that moves it.
     ticket: Option<Ticket>,
 }
 
 impl Theirs {
-    /// On its way where that is with a goal, else standing.
+    /// A part with a goal moves; without one it stands.
     fn of(ahead: Ahead, ticket: Option<Ticket>) -> Theirs {
         let does = if ticket.is_some() { Other::Moves } else { Other::Stands };
         Theirs { ahead, does, ticket }
@@ -65,25 +65,25 @@ impl Theirs {
 }
 
 impl Cell {
-    /// Whether an arm that is to go so keeps apart from the rest: on the course that its joints really take, and while it brakes at the end
-    /// of that course where the controller loses it there.
+    /// Whether an arm that follows `way` keeps its distance from the other parts: on the course that its joints really take, and while it brakes
+    /// beyond the end of that course, in case the controller loses it there.
     ///
     /// # Errors
-    /// Which links come too close, of what, and what that one is doing.
+    /// Names the links that come too close, their parts, and what the other part is doing.
     pub(super) fn arm_keeps_apart(&self, arm: usize, way: &Way) -> Result<(), String> {
         let from = self.arms.seen_from(arm, &self.measured()).finger;
         let joints = way.ahead(&self.robot, 0.0);
         let refused = ["the trajectory is refused: on the way ", "the trajectory is refused: its way"];
-        // Its fingers may open meanwhile.
+        // The arm's fingers may open during the motion.
         let to = self.opens_fingers_to(arm).unwrap_or(from);
         self.keeps_apart(&self.both_move(arm, &joints, [from, to], self.robot.links_of(arm)), refused)?;
         if from == to { Ok(()) } else { self.meets_not_itself(arm, &joints, [from, to], "the trajectory is refused") }
     }
 
-    /// Whether the fingers of an arm may go so: from and to these distances from the middle, in metres.
+    /// Whether the fingers of an arm may move between these distances from the middle, in metres.
     ///
     /// # Errors
-    /// Which links come too close, of what, and what that one is doing.
+    /// Names the links that come too close, their parts, and what the other part is doing.
     pub(super) fn fingers_keep_apart(&self, arm: usize, from: f64, to: f64) -> Result<(), String> {
         if from == to {
             return Ok(());
@@ -100,8 +100,8 @@ impl Cell {
         self.meets_not_itself(arm, &joints, [from, to], "the fingers stay where they are")
     }
 
-    /// What these links of an arm do whose joints move and whose fingers may go from one place to another meanwhile: both take their own time, so any
-    /// of the one comes with any of the other.
+    /// The future motion of these links of an arm whose joints move while its fingers may move from one position to another. Both take their own
+    /// time, so every finger position is combined with every joint posture.
     fn both_move(&self, arm: usize, joints: &[JointVector], fingers: [f64; 2], links: Vec<usize>) -> Ours {
         Ours {
             beside_moving: self.beside_moving(arm, joints, fingers, links.clone()),
@@ -109,18 +109,18 @@ impl Cell {
         }
     }
 
-    /// The same as it is compared with parts on their ways: the fingers may open as well.
+    /// The motion that is compared with moving parts: the fingers may open as well.
     fn beside_moving(&self, arm: usize, joints: &[JointVector], [from, to]: [f64; 2], links: Vec<usize>) -> Ahead {
         let part = Part::Arm(arm);
         let fingers: Vec<f64> = passed(from, to, OPENING_STEP_M).chain(self.may_open(arm, to)).collect();
-        // Either of two parts gets half.
+        // Each of the two parts gets half of the postures.
         let most = MAX_POSTURES / 2 / fingers.len();
         let Thinned { way, beside_m } = Levers::of(&self.robot, part, &links).thinned(joints, most);
         let between_m = if from == to { 0.0 } else { OPENING_STEP_M / 2.0 };
         Ahead { part, links, courses: courses(&way, fingers), beside_m, between_m }
     }
 
-    /// The same as it is compared with parts that stand.
+    /// The motion that is compared with standing parts.
     fn beside_standing(&self, arm: usize, joints: &[JointVector], [from, to]: [f64; 2], links: Vec<usize>) -> Ahead {
         let part = Part::Arm(arm);
         if from == to {
@@ -134,14 +134,15 @@ impl Cell {
         Ahead { part, links, courses, beside_m, between_m: step_m / 2.0 }
     }
 
-    /// Where the fingers of an arm may be besides, that are somewhere or on their way to there: open.
+    /// The open position of an arm's fingers, as a further position that they may take, where it differs from `finger`.
     fn may_open(&self, arm: usize, finger: f64) -> Option<f64> {
         let open = self.arms.open_finger_m(arm);
         (self.arms.view(arm).finger().is_some() && open != finger).then_some(open)
     }
 
-    /// Whether the fingers of an arm meet nothing of their own robot while they go so and its joints go so. A trajectory is checked with the fingers
-    /// where they are; how near the robot's links may come to each other is the same here. What is met where both begin says nothing of the way.
+    /// Whether the fingers of an arm touch nothing of their own robot while they and the arm's joints move. A trajectory is checked with the fingers
+    /// at their current position; the minimum distances between the robot's links are the same here. A pair of links that touches at the start says
+    /// nothing about the motion and is ignored.
     fn meets_not_itself(
         &self,
         arm: usize,
@@ -159,7 +160,7 @@ impl Cell {
         };
         let mut first = checker(from);
         let meets_already = joints.first().and_then(|posture| first.collision(posture, Contact::None));
-        // No step of a link is longer than the checker's own, and the last posture is always looked at.
+        // No link moves farther in one step than in a step of the checker, and the last posture is always checked.
         let mut way: Vec<&JointVector> = Vec::new();
         for (i, posture) in joints.iter().enumerate() {
             let next = joints.get(i + 1);
@@ -173,7 +174,7 @@ impl Cell {
                 "{near}: arm and fingers move too far at once to be checked: move one after the other"
             ));
         }
-        // From one finger position to the next they move by less than they are thick: nothing is passed over.
+        // Between two finger positions the fingers move by less than their thickness, so nothing is skipped.
         for finger in fingers {
             let mut checker = checker(finger);
             let met = way.iter().find_map(|posture| checker.collision(posture, Contact::None));
@@ -186,24 +187,24 @@ impl Cell {
         Ok(())
     }
 
-    /// Whether the head may turn so: from and to these positions of pan and tilt, in radians.
+    /// Whether the head may turn between these positions of pan and tilt, in radians.
     ///
     /// # Errors
-    /// Which links come too close, of what, and what that one is doing.
+    /// Names the links that come too close, their parts, and what the other part is doing.
     pub(super) fn head_keeps_apart(&self, from: [f64; 2], to: [f64; 2]) -> Result<(), String> {
         let (links, courses) = (self.robot.head_links(), vec![turned(from, to)]);
         let ours = Ahead { part: Part::Head, links, courses, beside_m: 0.0, between_m: 0.0 };
         self.keeps_apart(&Ours::alike(ours), ["the head stays where it is: ", "the head stays where it is: its way"])
     }
 
-    /// What may be on its way beside a part, or in its way.
+    /// The other parts that a part is compared with: the arms, and the head while it turns.
     fn beside(&self, part: Part) -> impl Iterator<Item = Part> {
         let turns = matches!(self.activities.get(&Module::PanTilt).map(|head| &head.kind), Some(Kind::Look { .. }));
         let others = self.arms.numbers().map(Part::Arm).chain(turns.then_some(Part::Head));
         others.filter(move |other| *other != part)
     }
 
-    /// `near` begins the sentence that something comes too near, `long` the one that this was not found out.
+    /// `near` begins the message that parts come too close, `long` the message that the motion is too long to check.
     fn keeps_apart(&self, ours: &Ours, [near, long]: [&str; 2]) -> Result<(), String> {
         let here = self.measured();
         let part = ours.beside_moving.part;
@@ -243,7 +244,7 @@ impl Cell {
         Ok(())
     }
 
-    /// A part for people.
+    /// The name of a part in messages.
     fn named(&self, part: Part) -> String {
         match part {
             Part::Arm(arm) => format!("the arm `{}`", self.arms.name(arm)),
@@ -251,7 +252,7 @@ impl Cell {
         }
     }
 
-    /// What another part does from now on.
+    /// The future motion of another part.
     fn ahead_of(&self, part: Part) -> Vec<Theirs> {
         match part {
             Part::Arm(arm) => self.ahead_of_arm(arm),
@@ -270,13 +271,13 @@ impl Cell {
         Theirs::of(Ahead { part: Part::Head, links, courses, beside_m: 0.0, between_m: 0.0 }, ticket)
     }
 
-    /// The fingers of an arm that stands may move: they are on their way then, and the rest of it stands.
+    /// An arm that stands may have moving fingers: they are then a moving part, and the rest of the arm a standing one.
     fn ahead_of_arm(&self, arm: usize) -> Vec<Theirs> {
         let finger = self.arms.seen_from(arm, &self.measured()).finger;
         let (joints, ticket) = self.joints_ahead(arm);
         let gripper = self.activities.get(&Module::Gripper(arm));
         let (to, fingers_ticket) = match gripper.map(|gripper| (&gripper.kind, gripper.ticket)) {
-            // What slips out of fingers lets them close fully.
+            // When an object slips out, the fingers close fully.
             Some((Kind::Close { .. }, ticket)) => (0.0, Some(ticket)),
             Some((Kind::Open { to, .. }, ticket)) => (*to, Some(ticket)),
             _ => (finger, None),
@@ -292,7 +293,7 @@ impl Cell {
         std::iter::once(Theirs::of(stands, None)).chain(moves).collect()
     }
 
-    /// Where the joints of an arm are from now on, and with which goal where it is on its way; else it stands.
+    /// The joint postures of an arm from now on, and the goal that moves it; without a goal the arm stands.
     fn joints_ahead(&self, arm: usize) -> (Vec<JointVector>, Option<Ticket>) {
         let activity = self.activities.get(&Module::Arm(arm));
         let followed = activity.and_then(|activity| match &activity.kind {
@@ -306,13 +307,13 @@ impl Cell {
     }
 }
 
-/// All of a way of joints with fingers at each of these places.
+/// One course per finger position: all joint postures with the fingers there.
 fn courses(way: &[JointVector], fingers: impl IntoIterator<Item = f64>) -> Vec<Vec<ArmPosition>> {
     let course = |finger: f64| way.iter().map(|joints| ArmPosition { joints: *joints, finger }).collect();
     fingers.into_iter().map(course).collect()
 }
 
-/// What these links of an arm do that stands while its fingers go from one place to another, and may be open.
+/// The motion of these links of a standing arm whose fingers move from one position to another, and may be open.
 fn fingers_alone(arm: usize, joints: JointVector, links: Vec<usize>, [from, to]: [f64; 2], open: Option<f64>) -> Ahead {
     let on_their_way: Vec<f64> = passed(from, to, FINGER_STEP_M).collect();
     let courses = std::iter::once(on_their_way).chain(open.map(|open| vec![open]));
@@ -320,13 +321,13 @@ fn fingers_alone(arm: usize, joints: JointVector, links: Vec<usize>, [from, to]:
     Ahead { part: Part::Arm(arm), links, courses: courses.map(at).collect(), beside_m: 0.0, between_m: 0.0 }
 }
 
-/// Positions of fingers on their way.
+/// Finger positions along their motion, at most `step_m` apart.
 fn passed(from: f64, to: f64, step_m: f64) -> impl Iterator<Item = f64> {
     let steps = ((to - from).abs() / step_m).ceil().max(1.0) as u32;
     (0..=steps).map(move |i| from + (to - from) * f64::from(i) / f64::from(steps))
 }
 
-/// Positions of a head on its way, which is a straight line in its joints.
+/// Head positions along its motion, which is a straight line in joint space.
 fn turned(from: [f64; 2], to: [f64; 2]) -> Vec<ArmPosition> {
     let most = (to[0] - from[0]).abs().max((to[1] - from[1]).abs());
     let steps = (most / HEAD_STEP_RAD).ceil().max(1.0) as u32;

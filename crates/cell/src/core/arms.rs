@@ -1,7 +1,7 @@
-//! The arms of the cell's robot: each has joints of its own, a gripper or none, and holds what is between its own fingers.
+//! The arms of the cell's robot: each has its own joints, may have a gripper, and holds the object between its own fingers.
 //!
-//! An arm has a number: 0 is the arm of the description's `[arm]`, the others follow in the order of `[[other_arm]]`. Everything that is
-//! specific to one arm is computed with the robot *seen from* that arm ([`Robot::with_arm`]). A robot with one arm has the number 0 alone.
+//! An arm has a number: 0 is the arm of the description's `[arm]`, the others follow in the order of `[[other_arm]]`. Everything specific to one arm
+//! is computed with the robot *seen from* that arm ([`Robot::with_arm`]). A robot with one arm has only the number 0.
 
 use super::grasping::Pads;
 use super::holding::Held;
@@ -11,7 +11,7 @@ use ratn_model::pose::Pose;
 use ratn_motion::robot::{ArmPosition, Configuration, Robot};
 use ratn_motion::workplace::HOME;
 
-/// The number of the arm that is meant where none is named.
+/// The number of the default arm.
 pub const FIRST: usize = 0;
 
 /// The arms of one robot.
@@ -23,11 +23,11 @@ struct Arm {
     name: String,
     /// The robot seen from this arm.
     view: Robot,
-    /// The gripper's pads; `None` of an arm without a gripper.
+    /// The gripper's pads; `None` for an arm without a gripper.
     pads: Option<Pads>,
-    /// How far each finger is from the middle when the gripper is open, in metres.
+    /// Distance of each finger from the middle when the gripper is open, in metres.
     open_finger_m: f64,
-    /// Where the fingers last were when they had closed, and around what.
+    /// Position of the fingers after they last closed, and what they closed around.
     closed: Closed,
     held: Option<Held>,
 }
@@ -55,7 +55,7 @@ impl Arms {
         Arms(arms)
     }
 
-    /// How many there are.
+    /// Number of arms.
     pub(super) fn count(&self) -> usize {
         self.0.len()
     }
@@ -75,32 +75,32 @@ impl Arms {
         &self.0[arm].view
     }
 
-    /// The pads of an arm's gripper; `None` where it has no gripper.
+    /// The pads of an arm's gripper; `None` without a gripper.
     pub(super) fn pads(&self, arm: usize) -> Option<&Pads> {
         self.0[arm].pads.as_ref()
     }
 
-    /// How far each finger of an arm is from the middle when its gripper is open, in metres.
+    /// Distance of each finger of an arm from the middle when its gripper is open, in metres.
     pub(super) fn open_finger_m(&self, arm: usize) -> f64 {
         self.0[arm].open_finger_m
     }
 
-    /// Where the fingers of an arm have closed last, and around what.
+    /// Position of an arm's fingers after they last closed, and what they closed around.
     pub(super) fn closed(&self, arm: usize) -> Closed {
         self.0[arm].closed
     }
 
-    /// The fingers of an arm have closed so far, around that.
+    /// Records that the fingers of an arm have closed to `at_m` metres from the middle around something.
     pub(super) fn close(&mut self, arm: usize, at_m: f64, around: Around) {
         self.have_closed(arm, Closed { at_m, around });
     }
 
-    /// That is where the fingers of an arm have closed last.
+    /// Sets the position and object of the last closing of an arm's fingers.
     pub(super) fn have_closed(&mut self, arm: usize, closed: Closed) {
         self.0[arm].closed = closed;
     }
 
-    /// An arm sets out: what its fingers are in that slipped out of them they push from now on.
+    /// An arm starts to move: from now on its fingers push the object that slipped out of them, even where they overlap with it.
     pub(super) fn sets_out(&mut self, arm: usize) {
         let around = &mut self.0[arm].closed.around;
         if *around == Around::Slipped {
@@ -108,51 +108,51 @@ impl Arms {
         }
     }
 
-    /// Whether the fingers of an arm, `finger` metres from the middle, may still be at what they have let go.
+    /// Whether the fingers of an arm, `finger` metres from the middle, may still be at an object that they released.
     pub(super) fn is_at_what_it_let_go(&self, arm: usize, finger: f64) -> bool {
         let Arm { held, closed, open_finger_m, .. } = &self.0[arm];
         held.is_none() && closed.is_at_what_it_let_go(finger, *open_finger_m)
     }
 
-    /// Whether the fingers of an arm, `finger` metres from the middle, push what they meet where they do not close.
+    /// Whether the fingers of an arm, `finger` metres from the middle, push the objects that they meet without closing.
     pub(super) fn fingers_push(&self, arm: usize, finger: f64) -> bool {
         let Arm { held, closed, open_finger_m, .. } = &self.0[arm];
-        // Closed around something, they stand at its faces.
+        // Fingers that are closed around an object stand at its faces.
         held.is_some() || closed.pushes(finger, *open_finger_m)
     }
 
-    /// What an arm holds.
+    /// The object that an arm holds.
     pub(super) fn held(&self, arm: usize) -> Option<Held> {
         self.0[arm].held
     }
 
-    /// What every arm holds, in the order of their numbers.
+    /// The object that every arm holds, in the order of the arm numbers.
     pub(super) fn all_held(&self) -> Vec<Option<usize>> {
         self.0.iter().map(|arm| arm.held.map(|held| held.object)).collect()
     }
 
-    /// An arm holds something from now on, or nothing; what it held before.
+    /// Sets the object that an arm holds; returns the one that it held before.
     pub(super) fn hold(&mut self, arm: usize, held: Option<Held>) -> Option<Held> {
         std::mem::replace(&mut self.0[arm].held, held)
     }
 
-    /// What arms hold, to be changed.
+    /// The held objects of all arms, mutable.
     pub(super) fn held_mut(&mut self) -> impl Iterator<Item = &mut Held> {
         self.0.iter_mut().filter_map(|arm| arm.held.as_mut())
     }
 
-    /// The arm that holds an object, and how.
+    /// The arm that holds an object, and the grasp.
     pub(super) fn holder_of(&self, object: usize) -> Option<(usize, Held)> {
         let mut held = self.0.iter().enumerate().filter_map(|(number, arm)| Some((number, arm.held?)));
         held.find(|(_, held)| held.object == object)
     }
 
-    /// Whether something is held that may still slip.
+    /// Whether any held object may still slip.
     pub(super) fn holds_unsteadily(&self) -> bool {
         self.0.iter().any(|arm| arm.held.is_some_and(|held| !held.is_steady()))
     }
 
-    /// The tools of all arms in the world frame, of the robot as seen from the first arm.
+    /// The tool poses of all arms in the world frame, for a configuration of the robot as seen from the first arm.
     pub(super) fn tools(&self, configuration: &Configuration) -> Vec<Pose> {
         let poses = self.0[FIRST].view.poses(configuration);
         self.0.iter().map(|arm| poses[arm.view.tool]).collect()
@@ -163,7 +163,7 @@ impl Arms {
         self.0[FIRST].view.seen_from(arm, configuration)
     }
 
-    /// Every arm in its posture `home` (else where the robot has it) with open fingers.
+    /// Every arm in its posture `home` (without one, at the robot's default position) with open fingers.
     pub(super) fn first_posture(&self) -> Configuration {
         let robot = &self.0[FIRST].view;
         let mut first = robot.with_all_arms(&robot.at_zero());
@@ -176,7 +176,7 @@ impl Arms {
         first
     }
 
-    /// The same configuration with open fingers of all arms but one.
+    /// The same configuration with the fingers of all other arms open.
     pub(super) fn with_others_open(&self, arm: usize, configuration: &Configuration) -> Configuration {
         let mut opened = *configuration;
         for other in self.numbers().filter(|other| *other != arm) {

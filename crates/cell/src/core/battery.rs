@@ -1,6 +1,6 @@
-//! A battery that drains with time, faster while the arm moves, and faster still while the base does.
+//! A battery that drains with time, faster while the arm moves, and even faster while the base moves.
 //!
-//! Times are added up exactly: how full it is does not depend on how often it is looked at.
+//! Times are added up exactly: the level does not depend on how often it is read.
 
 use crate::config::BatteryConfig;
 use std::time::Duration;
@@ -8,9 +8,9 @@ use std::time::Duration;
 #[derive(Debug, Clone)]
 pub(crate) struct Battery {
     config: BatteryConfig,
-    /// How full it was when it was made.
+    /// The level when the battery was created.
     level: f64,
-    /// The time since, and how much of it the arm and the base moved.
+    /// The time since then, and the parts of it during which the arm and the base moved.
     passed: Duration,
     moving: Duration,
     driving: Duration,
@@ -21,12 +21,12 @@ impl Battery {
         Battery::at(config, config.level)
     }
 
-    /// One that is as full as that.
+    /// A battery with this level.
     pub(crate) fn at(config: BatteryConfig, level: f64) -> Battery {
         Battery { config, level, passed: Duration::ZERO, moving: Duration::ZERO, driving: Duration::ZERO }
     }
 
-    /// How full it is, 0 to 1.
+    /// The level, 0 to 1.
     pub(crate) fn level(&self) -> f64 {
         let hours = |time: Duration| time.as_secs_f64() / 3600.0;
         let idle = self.config.idle_per_hour * hours(self.passed);

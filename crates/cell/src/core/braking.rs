@@ -1,15 +1,15 @@
-//! How motions stop and go on again: along their path, by slowing down the time of the motion, with each joint within its limits.
+//! How motions stop and resume: along their path, by slowing down the motion's time, with each joint within its limits.
 //!
-//! A motion is a function of a time τ of its own, which normally runs as fast as real time. To stop, its rate r = dτ/dt falls from 1 to 0,
-//! step by step, as fast as the joints allow. A joint is then accelerated by q″r² + q′ṙ (Bobrow, Dubowsky and Gibson, "Time-optimal control of
-//! robotic manipulators along specified paths", IJRR 1985); the most negative ṙ is taken with which no joint exceeds its limit. Where the motion
-//! itself decelerates a joint at its limit, that would be ṙ = 0, and on some motions there is always such a joint. So the rate falls at least as
-//! fast as the part `URGENT` of each limit allows, and such a joint exceeds its limit by that part. To go on, the rate rises in the same way. The
-//! robot never leaves the path that was checked. The jerk is not limited.
+//! A motion is a function of its own time τ, which normally runs as fast as real time. To stop, its rate r = dτ/dt falls from 1 to 0, step by step,
+//! as fast as the joints allow. The acceleration of a joint is then q″r² + q′ṙ (Bobrow, Dubowsky and Gibson, "Time-optimal control of robotic
+//! manipulators along specified paths", IJRR 1985); the most negative ṙ is used with which no joint exceeds its limit. Where the motion itself
+//! decelerates a joint at its limit, that would be ṙ = 0, and on some motions there is always such a joint. So the rate falls at least as fast as the
+//! part `URGENT` of each limit allows, and such a joint exceeds its limit by that part. To resume, the rate rises in the same way. The robot never
+//! leaves the path that was checked. The jerk is not limited.
 //!
-//! A stop on request, a hold and a lost lease brake within the limits that motions are planned by. An emergency stop is of category 1
-//! (IEC 60204-1): the joints brake within [`EMERGENCY`] times those limits, then the brakes close. The fingers and the camera's head,
-//! which are slow, end at once.
+//! A stop on request, a hold and a lost lease brake within the limits that motions are planned with. An emergency stop is of category 1
+//! (IEC 60204-1): the joints brake within [`EMERGENCY`] times those limits, then the brakes close. The fingers and the camera's head, which are
+//! slow, stop at once.
 
 use super::activity::seconds;
 use super::environment::STEP;
@@ -21,68 +21,68 @@ use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{Configuration, Joint, Robot};
 use std::time::Duration;
 
-/// How much harder than motions are planned an emergency stop brakes.
+/// The acceleration limits of an emergency stop, as a multiple of the limits for planning.
 pub const EMERGENCY: f64 = 2.0;
-/// The part of a limit that is used: between the steps of the course the accelerations are not known.
+/// The usable part of a limit: between the steps of the course the accelerations are not known.
 const USED: f64 = 0.95;
-/// The part of a limit that braking uses at least, on top of what the motion itself uses. With it a joint that moves at its greatest speed and
-/// already decelerates at its limit stands after 2.3 times the time that braking alone takes.
+/// The minimum part of a limit that braking uses, in addition to what the motion itself uses. With it, a joint that moves at its maximum speed and
+/// already decelerates at its limit stops in 2.3 times the time that braking alone takes.
 const URGENT: f64 = 0.2;
-/// The most steps that it takes to set out again: a minute.
+/// The maximum number of steps until a motion runs at full rate again: a minute.
 const MAX_STEPS: usize = 15_000;
 
-/// The time by which motions go on: as fast as real time, not at all, or on the way from one to the other.
+/// The clock of motions: it runs as fast as real time, stands, or changes from one to the other.
 #[derive(Debug, Clone)]
 pub(super) struct MotionClock {
     pace: Pace,
-    /// The time of motions when the pace began.
+    /// The motion time when the pace began.
     from: Timestamp,
 }
 
-/// A motion that is coming to rest, independently of a hold of everything else.
+/// A motion that is coming to rest, independently of a hold of all motions.
 #[derive(Debug, Clone)]
 pub(super) struct Braking {
     pub(super) ticket: Ticket,
     pub(super) ending: Ending,
     way: Way,
-    /// How far it had come along its course when it began to brake, in seconds.
+    /// Its progress along its course when it began to brake, in seconds.
     from_s: f64,
     pace: Pace,
 }
 
-/// What the robot follows.
+/// A trajectory that the robot follows.
 #[derive(Debug, Clone)]
 pub(super) enum Way {
-    /// With the arm of this number.
+    /// For the arm of this number.
     Arm(usize, Motion),
-    /// With its base.
+    /// For the base.
     Base(Motion),
 }
 
-/// A motion that slows down, or sets out again.
+/// A motion that slows down or resumes.
 struct Along<'a> {
     motion: &'a Motion,
-    /// How far it has come, in seconds of its own.
+    /// Its progress, in seconds of motion time.
     from_s: f64,
-    /// The greatest accelerations of its joints.
+    /// The maximum accelerations of its joints.
     limits: JointVector,
 }
 
-/// How time goes on for what moves, from a moment on.
+/// The progress of motion time from a moment on.
 #[derive(Debug, Clone)]
 struct Pace {
     since: Timestamp,
-    /// Seconds that have passed for it, after every [`STEP`] since, and the rate then; between them the rate changes evenly.
+    /// Seconds of motion time after every [`STEP`], with the rate at that moment; the rate changes linearly in between.
     course: Vec<[f64; 2]>,
 }
 
 impl MotionClock {
-    /// A clock that goes on as fast as real time.
+    /// A clock that runs as fast as real time.
     pub(super) fn new(now: Timestamp) -> MotionClock {
         MotionClock { pace: Pace::at_once(now, 1.0), from: now }
     }
 
-    /// The time of motions at `now`, which is not before the last change.
+    /// The motion time at `now`, which is not before the last change.
     pub(super) fn motion_time(&self, now: Timestamp) -> Timestamp {
         let (settles, passed) = (self.pace.settles(), self.pace.whole());
         if now < settles {
@@ -91,7 +91,7 @@ impl MotionClock {
         if self.pace.then() > 0.0 { self.from + passed + now.since(settles) } else { self.from + passed }
     }
 
-    /// When the time of motions will be that; `None` where it stands before.
+    /// The real time at which the motion time is reached; `None` if the clock stops before.
     pub(super) fn real_time(&self, motion_time: Timestamp) -> Option<Timestamp> {
         let whole = self.from + self.pace.whole();
         if motion_time >= whole {
@@ -101,28 +101,27 @@ impl MotionClock {
         Some(self.pace.when(motion_time.since(self.from).as_secs_f64()))
     }
 
-    /// Whether this time stands.
+    /// Whether the clock stands.
     pub(super) fn stands(&self, now: Timestamp) -> bool {
         self.pace.then() == 0.0 && now >= self.pace.settles()
     }
 
-    /// When it will stand, where it is told to.
+    /// When the clock will stand, if it was told to stop.
     pub(super) fn comes_to_stand(&self) -> Option<Timestamp> {
         (self.pace.then() == 0.0).then(|| self.pace.settles())
     }
 
-    /// Whether it goes on, or was told to.
+    /// Whether the clock runs, or was told to run again.
     pub(super) fn goes_on(&self) -> bool {
         self.pace.then() > 0.0
     }
 
-    /// How fast it goes on.
+    /// The rate of the clock, 0 to 1.
     pub(super) fn rate(&self, now: Timestamp) -> f64 {
         self.pace.rate(now)
     }
 
-    /// Tells it to go on or to stand. It changes as fast as every motion under way allows; each comes with how far along it the robot is, in
-    /// seconds.
+    /// Lets the clock run or stop. It changes as fast as every active motion allows; each motion comes with its progress, in seconds.
     pub(super) fn change(
         &mut self,
         robot: &Robot,
@@ -141,7 +140,7 @@ impl MotionClock {
 }
 
 impl Braking {
-    /// Begins to brake now, at `times` the limits of the joints; the motion is at a rate and has come so far along its course, in seconds.
+    /// Begins to brake now, within `times` the limits of the joints, from the motion's rate and its progress along its course, in seconds.
     pub(super) fn begin(
         robot: &Robot,
         now: Timestamp,
@@ -154,18 +153,18 @@ impl Braking {
         Braking { ticket, ending, way, from_s, pace }
     }
 
-    /// It brakes at `times` the limits from now on.
+    /// Brakes within `times` the limits from now on.
     pub(super) fn harder(&mut self, robot: &Robot, now: Timestamp, times: f64) {
         let (rate, from_s) = (self.pace.rate(now), self.from_s + self.pace.passed_s(now));
         (self.pace, self.from_s) = (self.way.pace(robot, now, [rate, 0.0], from_s, times), from_s);
     }
 
-    /// When it stands.
+    /// When the motion has come to rest.
     pub(super) fn ends(&self) -> Timestamp {
         self.pace.settles()
     }
 
-    /// Brings the joints that move to where they are.
+    /// Sets the moving joints to their current positions.
     pub(super) fn place(&self, now: Timestamp, configuration: &mut Configuration) {
         let at_s = self.from_s + self.pace.passed_s(now);
         match &self.way {
@@ -177,13 +176,13 @@ impl Braking {
         }
     }
 
-    /// Where the joints are now, at every later [`STEP`] of their course, and where they will stand.
+    /// The joint positions now, at every later [`STEP`] of the course, and at rest.
     pub(super) fn ahead(&self, now: Timestamp) -> Vec<JointVector> {
         let from_s = self.from_s + self.pace.passed_s(now);
         self.way.between(from_s, self.from_s + self.pace.whole().as_secs_f64())
     }
 
-    /// How well it followed its trajectory, as far as it has come.
+    /// The tracking errors so far.
     pub(super) fn tracking(&self, now: Timestamp) -> Tracking {
         self.way.tracking(self.from_s + self.pace.passed_s(now))
     }
@@ -197,7 +196,7 @@ impl Way {
         }
     }
 
-    /// What slows down, where it has come so far, in seconds of its own.
+    /// The motion as an input of braking, at its progress `from_s`, in seconds of motion time.
     fn along<'a>(&'a self, robot: &Robot, from_s: f64, times: f64) -> Along<'a> {
         match self {
             Way::Arm(arm, motion) => Along { motion, from_s, limits: limits(robot.joints_of(*arm), times) },
@@ -209,15 +208,15 @@ impl Way {
         Pace::change(now, rates, &[self.along(robot, from_s, times)])
     }
 
-    /// Where the joints are `time_s` after the start and at every later [`STEP`] to the end of their course, and from there until they stand:
-    /// a controller that has lost its joints brakes beyond that end.
+    /// The joint positions `time_s` after the start, at every later [`STEP`] to the end of the course, and from there until the joints stand: a
+    /// controller that has lost its joints brakes beyond that end.
     pub(super) fn ahead(&self, robot: &Robot, time_s: f64) -> Vec<JointVector> {
         let ends_s = self.motion().course_s();
         let brakes = self.pace(robot, Timestamp::default(), [1.0, 0.0], ends_s, 1.0);
         self.between(time_s, ends_s + brakes.whole().as_secs_f64())
     }
 
-    /// Where the joints are at a moment of their course, at every later [`STEP`] and at another moment.
+    /// The joint positions at one moment of the course, at every later [`STEP`] and at another moment.
     fn between(&self, from_s: f64, to_s: f64) -> Vec<JointVector> {
         let (motion, dt) = (self.motion(), STEP.as_secs_f64());
         let steps = ((to_s - from_s) / dt).ceil().max(0.0) as usize;
@@ -232,18 +231,18 @@ impl Way {
 }
 
 impl Pace {
-    /// As fast as time (1), or not at all (0), at once.
+    /// A constant rate: real time (1) or standstill (0).
     fn at_once(since: Timestamp, rate: f64) -> Pace {
         Pace { since, course: vec![[0.0, rate]] }
     }
 
-    /// From a rate to another: as fast as the joints of all that moves can.
+    /// Changes the rate as fast as the joints of all motions allow.
     fn change(since: Timestamp, [mut rate, then]: [f64; 2], along: &[Along<'_>]) -> Pace {
         let (dt, brakes) = (STEP.as_secs_f64(), then < rate);
         let mut passed = 0.0;
         let mut course = vec![[passed, rate]];
         while rate != then {
-            // What the joints do in the middle of the step.
+            // The joint velocities and accelerations in the middle of the step.
             let slope = |one: &Along<'_>| {
                 let (velocity, acceleration) = one.motion.derivatives(one.from_s + passed + 0.5 * rate * dt);
                 greatest_slope(&velocity, &acceleration, rate, brakes, &one.limits)
@@ -262,7 +261,7 @@ impl Pace {
         Pace { since, course }
     }
 
-    /// Seconds that have passed for what moves.
+    /// Seconds of motion time that have passed.
     fn passed_s(&self, now: Timestamp) -> f64 {
         let (index, part_s) = self.step(now);
         let [passed, rate] = self.course[index];
@@ -276,7 +275,7 @@ impl Pace {
         self.course.get(index + 1).map_or(rate, |[_, next]| rate + (next - rate) * part_s / STEP.as_secs_f64())
     }
 
-    /// The last step that has begun, and how long ago, in seconds.
+    /// The last step that has begun, and the time since then, in seconds.
     fn step(&self, now: Timestamp) -> (usize, f64) {
         let since = now.since(self.since);
         let steps = usize::try_from(since.as_nanos() / STEP.as_nanos()).unwrap_or(usize::MAX);
@@ -284,7 +283,7 @@ impl Pace {
         (index, since.as_secs_f64() - index as f64 * STEP.as_secs_f64())
     }
 
-    /// When so many seconds will have passed for what moves, before the rate stays.
+    /// When this many seconds of motion time will have passed, before the rate is constant.
     fn when(&self, passed_s: f64) -> Timestamp {
         let last = self.course.len() - 1;
         let next = self.course.partition_point(|[passed, _]| *passed < passed_s).clamp(1, last.max(1));
@@ -294,28 +293,28 @@ impl Pace {
         self.since + seconds(((next - 1) as f64 + part) * STEP.as_secs_f64())
     }
 
-    /// The rate that stays: 0 or 1.
+    /// The final rate: 0 or 1.
     fn then(&self) -> f64 {
         self.course[self.course.len() - 1][1]
     }
 
-    /// From when on the rate stays.
+    /// When the rate becomes constant.
     fn settles(&self) -> Timestamp {
         self.since + STEP * u32::try_from(self.course.len() - 1).unwrap_or(u32::MAX)
     }
 
-    /// What has passed for what moves by then.
+    /// The motion time that has passed by then.
     fn whole(&self) -> Duration {
         seconds(self.course[self.course.len() - 1][0])
     }
 }
 
-/// The greatest accelerations of joints, `times` as much as motions are planned with.
+/// The maximum accelerations of joints, `times` those that motions are planned with.
 fn limits(joints: &[Joint], times: f64) -> JointVector {
     JointVector::from_fn(joints.len(), |j| joints[j].acceleration * times * USED)
 }
 
-/// How fast the rate may fall, or rise, in 1/s.
+/// How fast the rate may fall or rise, in 1/s.
 fn greatest_slope(
     velocity: &JointVector,
     acceleration: &JointVector,
@@ -324,7 +323,7 @@ fn greatest_slope(
     limits: &JointVector,
 ) -> f64 {
     let slope = |j: usize| {
-        // What the change of rate adds is along the velocity, or against it.
+        // The change of the rate accelerates a joint along its velocity or against it.
         let (v, a) = (if brakes { -velocity[j] } else { velocity[j] }, acceleration[j] * rate * rate);
         let room = if v >= 0.0 { limits[j] - a } else { limits[j] + a };
         let least = if brakes { URGENT * limits[j] } else { 0.0 };
@@ -341,8 +340,7 @@ mod tests {
     use ratn_model::value::{Trajectory, TrajectoryPoint};
     use ratn_motion::trajectory::Curve;
 
-    /// Each joint goes to and fro at the acceleration that it may have, a third of a swing behind the one before it: one of them always slows
-    /// down as hard as it may.
+    /// Each joint swings at its maximum acceleration, a third of a swing behind the joint before it: one of them always decelerates at its limit.
     fn swings(robot: &Robot, period_s: f64) -> Motion {
         let joints = robot.base_joints();
         let (quarter_s, swings) = (period_s / 4.0, 20);
@@ -383,7 +381,7 @@ mod tests {
         let joints = robot.base_joints();
         let fastest = (0..3).map(|j| joints[j].velocity / joints[j].acceleration).fold(f64::INFINITY, f64::min);
         let motion = swings(&robot, 4.0 * fastest);
-        // A controller overshoots: what the joints do anyway is more than their limits at some places.
+        // A controller overshoots: at some places the joints exceed their limits even without braking.
         let steps = (motion.lasts_s() / STEP.as_secs_f64()) as u32;
         let anyway: Vec<JointVector> =
             (0..steps).map(|i| motion.derivatives(f64::from(i) * STEP.as_secs_f64()).1).collect();
@@ -430,7 +428,7 @@ mod tests {
         let lost_at = braking.way.motion().at(lasts_s)[0];
         assert!(stands.base[0] > lost_at + 0.01, "it brakes over {} m", stands.base[0] - lost_at);
         assert!((ahead[ahead.len() - 1][0] - stands.base[0]).abs() < 1e-6, "{} {stands:?}", ahead[ahead.len() - 1][0]);
-        // While it brakes, what is before it ends at the same place.
+        // While it brakes, the motion ahead ends at the same place.
         let brakes = braking.ahead(now);
         assert!((brakes[0][0] - lost_at).abs() < 1e-9 && brakes.len() > 10 && brakes.len() < ahead.len());
         assert!((brakes[brakes.len() - 1][0] - stands.base[0]).abs() < 1e-6);

@@ -1,12 +1,12 @@
-//! The cell's state and its one way in: [`Cell::handle`].
+//! The cell's state and its only entry point: [`Cell::handle`].
 //!
 //! ```text
 //! module:  idle ──Start──▶ active ──its time is over──▶ idle      (Ended: done, or aborted with the reason)
 //!                            ├──Stop──▶ brakes ──it stands──▶ idle            (Ended: preempted)
 //!                            └──emergency stop──▶ brakes hard ──it stands──▶ idle   (Ended: stopped)
 //! ```
-//! Every event comes with the robot's time. What is due between the previous event and this one happens first, in its order. Motions have a
-//! time of their own, which a hold slows down to a stop and later lets go on ([`super::braking`]). [`Cell::next_wake`] says when something is due
+//! Every event comes with the robot's time. Everything due between the previous event and this one happens first, in order of time. Motions have
+//! their own time, which a hold slows down to a stop and later resumes ([`super::braking`]). [`Cell::next_wake`] returns when something is due
 //! without an event.
 
 use super::activity::{Activity, Kind, seconds};
@@ -38,45 +38,45 @@ pub struct Cell {
     /// The robot, seen from its first arm.
     pub(super) robot: Robot,
     pub(super) config: CellConfig,
-    /// Its arms, and what each holds.
+    /// The robot's arms, and what each holds.
     pub(super) arms: Arms,
     pub(super) now: Timestamp,
-    /// The time by which motions go on: behind `now` by as long as a hold was in force.
+    /// The time of motions: behind `now` by the duration of all holds.
     pub(super) motion_time: Timestamp,
     pub(super) clock: MotionClock,
     pub(super) safety: SafetyState,
-    /// Where the joints that do not move are, as their encoders and the localisation have it.
+    /// Positions of the joints that do not move, as measured by their encoders and the localisation.
     pub(super) resting: Configuration,
     pub(super) errors: Errors,
-    /// How often the base has come to a stop.
+    /// Number of stops of the base.
     pub(super) stops: u64,
     pub(super) activities: BTreeMap<Module, Activity>,
-    /// Motions that were told to stop and are coming to rest.
+    /// Motions that were told to stop and are braking.
     pub(super) braking: BTreeMap<Module, Braking>,
     pub(super) environment: Environment,
     /// The objects' names.
     pub(super) ids: Vec<String>,
-    /// How far each object leaned at the most while it was held, in radians.
+    /// The maximum lean of each object while it was held, in radians.
     pub(super) tilts: Vec<f64>,
     pub(super) contacts: Contacts,
     pub(super) faults: Faults,
-    /// Until when the camera is blind.
+    /// The time until which the camera is blind.
     pub(super) blind_until: Timestamp,
-    /// Until when the robot does not know where it stands.
+    /// The time until which the robot does not know where it stands.
     pub(super) lost_until: Timestamp,
     pub(super) battery: Battery,
     pub(super) seed: u64,
     pub(super) frames_taken: u64,
 }
 
-/// The most scenes that one picture can be made of; further frames count for the last one.
+/// The maximum number of scenes that one picture is made of; further frames count for the last one.
 const MAX_EXPOSURES: usize = 12;
 
 impl Cell {
     /// A cell at time 0.
     ///
     /// # Errors
-    /// [`PlacementError`] when no table can be laid, or the robot cannot stand in a cell.
+    /// [`PlacementError`] if no table can be laid, or the robot cannot stand in a cell.
     pub fn new(config: CellConfig) -> Result<Cell, PlacementError> {
         let robot = Robot::named_or_file(&config.robot)?;
         let pads = placement::fit(&robot, &config)?;
@@ -112,7 +112,7 @@ impl Cell {
         })
     }
 
-    /// Time goes on to `now`, and then the event happens.
+    /// Advances the time to `now`, then handles the event.
     pub fn handle(&mut self, now: Timestamp, event: Event) -> Vec<Command> {
         let mut out = Vec::new();
         self.advance(now, &mut out);
@@ -147,7 +147,7 @@ impl Cell {
         out
     }
 
-    /// When something is due without an event; `None` where nothing is.
+    /// When something is due without an event, if anything is.
     pub fn next_wake(&self) -> Option<Timestamp> {
         let ends = self.activities.values().map(|a| a.ends).min().and_then(|ends| self.clock.real_time(ends));
         let stands = self.clock.comes_to_stand().filter(|stands| *stands > self.now);
@@ -155,8 +155,8 @@ impl Cell {
         ends.into_iter().chain(self.faults.next()).chain(stands).chain(braking).min()
     }
 
-    /// Whether something moves. Then the caller has to handle ticks often: each step takes time to compute, and steps that are left until
-    /// the end of a motion make that end late.
+    /// Whether something moves. Then the caller has to send ticks often: each step takes time to compute, and steps that are left until the end of a
+    /// motion delay that end.
     pub fn is_restless(&self) -> bool {
         !self.environment.is_at_rest() || self.may_move()
     }
@@ -166,12 +166,12 @@ impl Cell {
         self.braking.is_empty() && (self.clock.goes_on() || self.clock.stands(self.now))
     }
 
-    /// Where the joints truly are, and the base with them.
+    /// The true positions of the joints and the base.
     pub fn configuration(&self) -> Configuration {
         self.errors.truth(&self.measured())
     }
 
-    /// Where the robot believes its joints to be: the arms by their encoders, the base by its localisation.
+    /// The measured positions: the arms by their encoders, the base by its localisation.
     pub fn measured(&self) -> Configuration {
         let mut configuration = self.resting;
         for (module, activity) in &self.activities {
@@ -190,17 +190,17 @@ impl Cell {
         configuration
     }
 
-    /// Where the base truly stands, in the world frame.
+    /// The true pose of the base, in the world frame.
     pub fn base_pose(&self) -> Pose {
         standing(self.configuration().base)
     }
 
-    /// Where the base believes to stand, in the world frame.
+    /// The pose of the base by its localisation, in the world frame.
     pub fn believed_base_pose(&self) -> Pose {
         standing(self.measured().base)
     }
 
-    /// The ground truth: where every object really is, and on what.
+    /// The ground truth: the real pose of every object, and what it stands on.
     pub fn ground_truth(&self) -> Vec<TrueObject> {
         let tools = self.arms.tools(&self.configuration());
         let truth = |i: usize| {
@@ -220,17 +220,17 @@ impl Cell {
         (0..self.ids.len()).map(truth).collect()
     }
 
-    /// What touched that should not have, since the scene was laid: the first [`super::contacts::MAX_CONTACTS`].
+    /// The unintended contacts since the scene was laid: the first [`super::contacts::MAX_CONTACTS`].
     pub fn unintended_contacts(&self) -> Vec<Contact> {
         self.contacts.unintended()
     }
 
-    /// How full the battery is, 0 to 1.
+    /// The battery's level, 0 to 1.
     pub fn battery(&self) -> f64 {
         self.battery.level()
     }
 
-    /// How many faults are scheduled; more than [`super::faults::MAX_FAULTS`] are not taken.
+    /// Number of scheduled faults; at most [`super::faults::MAX_FAULTS`] are accepted.
     pub fn faults_to_come(&self) -> usize {
         self.faults.len()
     }
@@ -240,7 +240,7 @@ impl Cell {
         self.busy_with(module).is_some()
     }
 
-    /// The goal that a module is doing, or comes to rest from.
+    /// The goal that a module performs, or from which it is braking.
     pub(super) fn busy_with(&self, module: Module) -> Option<Ticket> {
         let active = self.activities.get(&module).map(|activity| activity.ticket);
         active.or(self.braking.get(&module).map(|braking| braking.ticket))
@@ -251,7 +251,7 @@ impl Cell {
         &self.robot
     }
 
-    /// The number of the arm of this name.
+    /// The number of the arm with this name.
     pub fn arm(&self, name: &str) -> Option<usize> {
         self.arms.numbers().find(|arm| self.arms.name(*arm) == name)
     }
@@ -259,33 +259,33 @@ impl Cell {
     /// The robot seen from one of its arms, by that arm's number.
     ///
     /// # Panics
-    /// Where the robot has no arm of this number.
+    /// If the robot has no arm with this number.
     pub fn robot_of(&self, arm: usize) -> &Robot {
         self.arms.view(arm)
     }
 
-    /// Where the robot has its joints, as the robot seen from one of its arms has them.
+    /// The measured positions, as the robot seen from one of its arms has them.
     pub fn measured_of(&self, arm: usize) -> Configuration {
         self.arms.seen_from(arm, &self.measured())
     }
 
-    /// The configuration that it was made with.
+    /// The configuration with which the cell was created.
     pub fn config(&self) -> &CellConfig {
         &self.config
     }
 
-    /// The seed of the present table.
+    /// The seed of the current scene.
     pub fn seed(&self) -> u64 {
         self.seed
     }
 
-    /// What collides: the furniture and the parts of all objects, those that the first arm holds in its gripper.
+    /// The collision scene: the furniture and the parts of all objects; those that the first arm holds are in its gripper.
     pub fn scene(&self) -> Scene {
         self.scene_of(FIRST)
     }
 
-    /// What collides, as it is seen from one of the arms, by its number. An object that this arm holds is placed in its gripper; an object that
-    /// another arm holds is placed in the world, where it is now.
+    /// The collision scene as seen from the arm of this number. An object that this arm holds is placed in its gripper; an object that another arm
+    /// holds is placed in the world, at its current pose.
     pub fn scene_of(&self, arm: usize) -> Scene {
         let tools = self.arms.tools(&self.configuration());
         let held = self.arms.held(arm);
@@ -310,7 +310,7 @@ impl Cell {
         }
     }
 
-    /// What a camera sees at this moment.
+    /// What a camera sees now.
     pub fn scenery(&self) -> Scenery {
         let configuration = self.configuration();
         let tools = self.arms.tools(&configuration);
@@ -341,7 +341,7 @@ impl Cell {
             self.deviate(out);
             self.come_to_rest(out);
             let Some((motion_due, _)) = moved.filter(|(_, moved)| *moved <= due) else { continue };
-            // Rounding does not keep anything from ending.
+            // A rounding error must not prevent a motion from ending.
             self.motion_time = self.motion_time.max(motion_due);
             let due = self.motion_time;
             if frame.is_some_and(|f| f <= due) {
@@ -349,7 +349,7 @@ impl Cell {
             }
             let over: Vec<Module> = self.activities.iter().filter(|(_, a)| a.ends <= due).map(|(m, _)| *m).collect();
             for module in over {
-                // The last frame is taken when the picture's time is over.
+                // The last frame is taken when the picture's time ends.
                 let unfinished = |a: &Activity| next_frame(a).is_some_and(|f| f <= due);
                 if !self.activities.get(&module).is_some_and(unfinished) {
                     self.finish(module, out);
@@ -413,8 +413,8 @@ impl Cell {
         out.push(Command::Ended { ticket: activity.ticket, ending, tracking });
     }
 
-    /// Ends activities: arm and base brake, at `times` the limits that motions are planned with, and what has come to rest has ended; what else
-    /// moves stays where it is.
+    /// Ends activities: arm and base brake, within `times` the limits that motions are planned with, and end when they have come to rest; other
+    /// moving parts stop where they are.
     pub(super) fn halt(
         &mut self,
         which: impl Fn(&Activity) -> bool,
@@ -428,7 +428,7 @@ impl Cell {
             let Some(activity) = self.activities.remove(&module) else { continue };
             let ending = ending(&activity);
             if let (Kind::Close { .. }, Some(arm)) = (&activity.kind, module.arm()) {
-                // What they would have closed around they may be in by now, or not.
+                // The fingers may or may not overlap the object by now.
                 self.arms.close(arm, self.arms.seen_from(arm, &self.resting).finger, Around::Slipped);
             }
             if matches!(activity.kind, Kind::Follow(_)) {
@@ -440,7 +440,7 @@ impl Cell {
         self.come_to_rest(out);
     }
 
-    /// A motion comes to rest from now on.
+    /// Starts to brake a motion.
     fn brake(&mut self, module: Module, activity: Activity, ending: Ending, times: f64) {
         let at_s = activity.elapsed_s(self.motion_time);
         if let Kind::Follow(way) = activity.kind {
@@ -450,7 +450,7 @@ impl Cell {
         }
     }
 
-    /// What brakes and stands by now has ended.
+    /// Ends the motions that have come to rest.
     fn come_to_rest(&mut self, out: &mut Vec<Command>) {
         let standing: Vec<Module> =
             self.braking.iter().filter(|(_, b)| b.ends() <= self.now).map(|(m, _)| *m).collect();
@@ -465,7 +465,7 @@ impl Cell {
         }
     }
 
-    /// The base stands: where it believes to is measured anew.
+    /// The base has stopped: its localisation gets a new error.
     fn relocalise(&mut self) {
         let stands = self.errors.truth(&self.resting).base;
         self.stops += 1;
@@ -473,7 +473,7 @@ impl Cell {
         self.resting.base = self.errors.believed(stands);
     }
 
-    /// What moves is to go on, or to stand.
+    /// Resumes or stops the motion clock.
     fn go_on(&mut self, goes_on: bool) {
         if goes_on == self.clock.goes_on() {
             return;
@@ -486,7 +486,7 @@ impl Cell {
         self.clock.change(&self.robot, [self.now, self.motion_time], goes_on, &ways);
     }
 
-    /// Everything ends and is where it is, as nothing real can: for when the world is made anew.
+    /// Ends everything at once at its current position, which no real robot can do: used when the scene is replaced.
     pub(super) fn freeze(&mut self, reason: &str, out: &mut Vec<Command>) {
         self.resting = self.measured();
         let active =
@@ -495,7 +495,7 @@ impl Cell {
         for (ticket, tracking) in active.chain(braking) {
             out.push(Command::Ended { ticket, ending: Ending::Aborted(reason.to_owned()), tracking });
         }
-        // A hold that was about to be one is one.
+        // A hold that was beginning is complete.
         let goes_on = self.clock.goes_on();
         self.clock.change(&self.robot, [self.now, self.motion_time], goes_on, &[]);
     }
@@ -506,7 +506,7 @@ impl Cell {
         self.seed = seed;
         self.stops = 0;
         self.errors = Errors::new(self.config.errors, &joint_counts(&self.robot), seed, 0);
-        // The request was checked before it became an event; a table that cannot be laid is an empty one.
+        // The request was checked before it became an event; if the table cannot be laid, it is empty.
         let objects = placement::objects(&self.robot, self.config.scene, goods, seed).unwrap_or_default();
         for arm in self.arms.numbers() {
             self.arms.hold(arm, None);
@@ -518,7 +518,7 @@ impl Cell {
         self.environment.skip_until(self.now);
     }
 
-    /// One frame of the picture under way.
+    /// Takes one frame of the current picture.
     fn expose(&mut self) {
         let scenery = self.scenery();
         let period = seconds(1.0 / self.config.camera.frames_per_s);
@@ -538,7 +538,7 @@ impl Cell {
     }
 }
 
-/// When the next frame of a picture is due. Rounding of periods never moves the last one past the picture's end.
+/// When the next frame of a picture is due. Rounding of periods never moves the last frame past the picture's end.
 fn next_frame(activity: &Activity) -> Option<Timestamp> {
     match &activity.kind {
         Kind::Capture { frames, taken, next, .. } if taken < frames => Some((*next).min(activity.ends)),
@@ -546,7 +546,7 @@ fn next_frame(activity: &Activity) -> Option<Timestamp> {
     }
 }
 
-/// Everything that stands there, and the names of what can be moved.
+/// The environment with everything in the cell, and the names of the movable objects.
 fn environment(
     robot: &Robot,
     configuration: &Configuration,
@@ -558,12 +558,12 @@ fn environment(
     (environment, objects.iter().map(|o| o.id.clone()).collect())
 }
 
-/// A base in the world frame.
+/// The pose of a base in the world frame.
 fn standing([x, y, heading]: [f64; 3]) -> Pose {
     Pose::from_rpy([x, y, 0.0], 0.0, 0.0, heading)
 }
 
-/// How many joints each arm has.
+/// The number of joints of each arm.
 pub(super) fn joint_counts(robot: &Robot) -> Vec<usize> {
     (0..robot.arm_names().count()).map(|arm| robot.joints_of(arm).len()).collect()
 }

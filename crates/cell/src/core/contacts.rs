@@ -1,14 +1,14 @@
-//! Which contacts were meant: what the environment says of touching bodies, judged by what the robot was doing.
+//! Decides which contacts were intended: the environment reports touching bodies, and they are judged by what the robot was doing.
 //!
 //! ```text
-//!                    ┌─ a finger at what it closes around next, or has just let go (Approach, Depart), or at what it holds (Grasp)
-//! two bodies touch ──┼─ what is held above what it stood on when its motion began (LiftOff), or is set down on (SetDown)
-//!                    ├─ an object stands on a link that stands, too (Stands); something was put there by a fault (PutThere)
-//!                    └─ everything else is unintended
+//!                    ┌─ a finger at the object that it grasps next or has just released (Approach, Depart), or that it holds (Grasp)
+//! two bodies touch ──┼─ a held object above its support when the motion began (LiftOff), or where it is set down (SetDown)
+//!                    ├─ an object on a link that does not move (Stands); an object that a fault put there (PutThere)
+//!                    └─ every other contact is unintended
 //! ```
-//! An episode begins when two bodies touch and ends when they have come apart. Some episodes are judged only later: a finger may brush what it
-//! grasps next, but an object that it brushed and did not close around was hit; and an object is set down on what it comes to stand on. A meant
-//! contact has a bound as well: one that goes deeper than [`PRESS_M`] is unintended.
+//! An episode begins when two bodies touch and ends when they have separated. Some episodes are judged later: a finger may brush the object that it
+//! grasps next, but an object that it brushed and did not close around was hit; and an object is set down on the body that it finally stands on. An
+//! intended contact has a bound as well: one deeper than [`PRESS_M`] is unintended.
 
 use super::environment::{Environment, Thing, Touch};
 use ratn_model::time::Timestamp;
@@ -16,35 +16,35 @@ use ratn_motion::robot::Robot;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// What counts as no contact, in metres: the engine itself lets bodies sink into each other by half as much, and pushes
-/// something that rests by as much before it is still. Nothing is added for controllers that lag: the judge sees where the joints are.
+/// Contacts up to this depth are ignored, in metres: the engine itself lets bodies overlap by half of it, and pushes a resting body by as much before
+/// it is still. Nothing is added for controllers that lag: contacts are judged by the true joint positions.
 pub const TOLERANCE_M: f64 = 0.001;
-/// How deep what is held may be pressed into what it was lifted from or is set down on, and how far a finger may push what it
-/// grasps or lets go, in metres: poses are measured, with an error of millimetres.
+/// Maximum depth to which a held object may be pressed into the body that it is lifted from or set down on, and maximum distance by which a finger
+/// may push an object that it grasps or releases, in metres: poses are measured with an error of millimetres.
 pub const PRESS_M: f64 = 0.015;
-/// A support is level where its normal points up by at least this much.
+/// A support is level if its normal has at least this upward component.
 const LEVEL: f64 = 0.7;
-/// How many contacts are kept: the first ones.
+/// Maximum number of stored contacts: the first ones.
 pub const MAX_CONTACTS: usize = 64;
 
 /// An episode of two bodies in contact.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Contact {
-    /// When it began, in the robot's time.
+    /// When the episode began, in the robot's time.
     pub began: Timestamp,
-    /// When it ended; when it was last seen, where it goes on.
+    /// When the episode ended; if it continues, when it was last seen.
     pub ended: Timestamp,
     /// The two bodies: names of links, of furniture, of objects.
     pub bodies: [String; 2],
-    /// How deep they were in each other at the most, in metres.
+    /// Maximum depth of the overlap, in metres.
     pub depth_m: f64,
-    /// How far an object that nobody held was pushed from where it was, in metres.
+    /// How far an object that is not held was pushed from its place, in metres.
     pub pushed_m: f64,
-    /// Where it was deepest, in the world frame.
+    /// Point of the deepest overlap, in the world frame.
     pub at: [f64; 3],
-    /// How fast one moved as seen from the other at the most, in metres per second.
+    /// Maximum speed of the bodies relative to each other, in metres per second.
     pub speed_m_s: f64,
-    /// Its purpose; `None` where it was not meant.
+    /// The purpose of the contact; `None` if it is unintended.
     pub meant: Option<Purpose>,
 }
 
@@ -52,30 +52,29 @@ pub struct Contact {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Purpose {
-    /// A finger comes to what it closes around next.
+    /// A finger reaches the object that it closes around next.
     Approach,
-    /// A finger at what it holds, or tried to.
+    /// A finger at the object that it holds, or tried to hold.
     Grasp,
-    /// A finger leaves what it has let go.
+    /// A finger leaves the object that it released.
     Depart,
-    /// What is held leaves what it stood on, which is below it.
+    /// A held object leaves the body below it, on which it stood.
     LiftOff,
-    /// An object is let go on something and comes to stand on it. Another object counts as what it stands on only where no furniture and no link
-    /// bears it.
+    /// A released object comes to stand on this body. Another object counts as the support only if no furniture and no link supports it.
     SetDown,
     /// An object stands on a link that the arm does not move.
     Stands,
-    /// A fault put it there.
+    /// A fault put the object there.
     PutThere,
 }
 
-/// An episode that goes on.
+/// An episode that is not over.
 #[derive(Debug, Clone)]
 struct Episode {
     contact: Contact,
-    /// Where the object was that is not held.
+    /// The object that is not held, and its position when the episode began.
     from: Option<(usize, [f64; 3])>,
-    /// How much of the normal points up where it is deepest.
+    /// The upward component of the normal at the deepest point.
     up: f64,
 }
 
@@ -84,67 +83,67 @@ struct Episode {
 pub(super) struct Contacts {
     fingers: Fingers,
     open: BTreeMap<[Thing; 2], Episode>,
-    /// Fingers at objects, over before it is known what for.
+    /// Ended contacts of fingers with objects whose purpose is not known yet.
     waiting: Vec<(AtObject, Contact)>,
     /// The grippers, by the numbers of their arms.
     hands: Vec<Hand>,
     /// The names of the links that each arm moves, by the numbers of the arms.
     arm_links: Vec<Vec<String>>,
-    /// What was let go above something, until it has come to rest.
+    /// Objects that were released above something and have not come to rest.
     settling: Vec<(usize, Thing, Contact)>,
-    /// What a fault put somewhere since the last step.
+    /// The object that a fault moved since the last step.
     put: Option<usize>,
     judged: Vec<Contact>,
-    /// Of those, the ones that nobody was told of.
+    /// The judged contacts that have not been reported.
     fresh: Vec<Contact>,
 }
 
-/// The names of the links that are fingers, by the numbers of their arms.
+/// The names of the links that are fingers, by arm number.
 #[derive(Debug, Clone, Default)]
 struct Fingers(Vec<Vec<String>>);
 
-/// A finger of an arm at an object.
+/// A finger of an arm that touches an object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct AtObject {
     arm: usize,
     object: usize,
 }
 
-/// What goes on at a gripper.
+/// The state of a gripper, for judging its contacts.
 #[derive(Debug, Clone, Copy, Default)]
 struct Hand {
-    /// What its fingers have let go, or closed around in vain, until they are away from it.
+    /// The object that its fingers have released, or failed to grasp, until they are away from it.
     parting: Option<Parting>,
-    /// It has just grasped something.
+    /// It has just closed its fingers.
     grasped: bool,
 }
 
-/// What the fingers part from.
+/// The object that fingers leave.
 #[derive(Debug, Clone, Copy)]
 struct Parting {
     object: usize,
-    /// A motion has set out since: the fingers are no longer where they let go of it.
+    /// A motion has begun since: the fingers are no longer where they released it.
     set_out: bool,
 }
 
-/// What the robot is doing at a step.
+/// What the robot is doing in a step.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Doing<'a> {
     pub(super) now: Timestamp,
-    /// What each arm is doing, by their numbers.
+    /// What each arm is doing, by arm number.
     pub(super) arms: &'a [ArmDoing],
 }
 
-/// What an arm and its gripper are doing at a step.
+/// What an arm and its gripper are doing in a step.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ArmDoing {
-    /// What its fingers hold.
+    /// The object that its fingers hold.
     pub(super) held: Option<usize>,
-    /// It is on its way itself.
+    /// The arm itself moves.
     pub(super) moves: bool,
-    /// It is on its way, or the base that carries it is.
+    /// The arm moves, or the base that carries it.
     pub(super) is_moved: bool,
-    /// Its fingers push what they meet; while they close they do not.
+    /// The fingers push the objects that they touch; closing fingers do not.
     pub(super) fingers_solid: bool,
 }
 
@@ -156,7 +155,7 @@ impl Doing<'_> {
 }
 
 impl Purpose {
-    /// As in a text.
+    /// The name of the purpose in texts.
     pub fn name(self) -> &'static str {
         match self {
             Purpose::Approach => "approach",
@@ -171,7 +170,7 @@ impl Purpose {
 }
 
 impl Contact {
-    /// Whether it counts: it was not meant, or went too deep, by more than a tolerance.
+    /// Whether the contact counts: it was unintended, or too deep, by more than a tolerance.
     pub fn is_unintended(&self) -> bool {
         let most = match self.meant {
             None => TOLERANCE_M,
@@ -195,7 +194,7 @@ impl std::fmt::Display for Contact {
 }
 
 impl Fingers {
-    /// The finger that one of the two things is, and the object at which it is.
+    /// The arm and object of this contact, if it is between a finger and an object.
     fn at(&self, things: &[Thing; 2]) -> Option<AtObject> {
         let [Thing::Link(link), Thing::Object(object)] = things else { return None };
         let arm = self.0.iter().position(|of_arm| of_arm.contains(link))?;
@@ -204,7 +203,7 @@ impl Fingers {
 }
 
 impl Contacts {
-    /// Of this robot, nothing touched yet.
+    /// Contacts of this robot; nothing has touched yet.
     pub(super) fn of(robot: &Robot) -> Contacts {
         let arms = 0..robot.arm_names().count();
         let names = |links: Vec<usize>| links.into_iter().map(|link| robot.model.links[link].name.clone()).collect();
@@ -216,10 +215,10 @@ impl Contacts {
         }
     }
 
-    /// After a step: what touches what.
+    /// Records which bodies touch after a step.
     pub(super) fn observe(&mut self, touches: &[Touch], doing: Doing<'_>, environment: &Environment, ids: &[String]) {
         let fingers = self.fingers.clone();
-        // They have opened after a grasp in vain: what they are in from now on they push.
+        // Fingers that have opened after a failed grasp push the object that they are in from now on.
         let in_vain = |things: &[Thing; 2], e: &Episode| {
             let opened = |at: AtObject| doing.arms[at.arm].fingers_solid && doing.arms[at.arm].held != Some(at.object);
             e.contact.meant == Some(Purpose::Grasp) && fingers.at(things).is_some_and(opened)
@@ -244,7 +243,7 @@ impl Contacts {
         self.hands.iter_mut().for_each(|hand| hand.grasped = false);
     }
 
-    /// The fingers of an arm begin to close: what they touch already they came to.
+    /// The fingers of an arm begin to close: the objects that they already touch may be the ones that they came to grasp.
     pub(super) fn closing(&mut self, arm: usize) {
         let fingers = self.fingers.clone();
         let of_arm = |things: &[Thing; 2]| fingers.at(things).is_some_and(|at| at.arm == arm);
@@ -252,7 +251,7 @@ impl Contacts {
         self.waiting.extend(came.into_iter().filter_map(|(things, e)| Some((fingers.at(&things)?, e.contact))));
     }
 
-    /// The fingers of an arm have closed around an object, in vain or not; `None`: around nothing.
+    /// The fingers of an arm have closed around an object, whether they hold it or not; `None` if around nothing.
     pub(super) fn closed(&mut self, arm: usize, around: Option<usize>, environment: &Environment) {
         self.settle(|object| Some(object) == around, environment);
         let Contacts { fingers, open, .. } = self;
@@ -269,10 +268,10 @@ impl Contacts {
         self.hands[arm] = Hand { parting: around.map(|object| Parting { object, set_out: false }), grasped: true };
     }
 
-    /// The fingers of an arm have let go of an object, on purpose or not.
+    /// The fingers of an arm have released an object, on purpose or not.
     pub(super) fn let_go(&mut self, arm: usize, object: usize, on_purpose: bool) {
         for ([below, _], Episode { mut contact, up, .. }) in self.take(|things, _| things[1] == Thing::Object(object)) {
-            // The normal leads from what it stands on to what is held.
+            // The normal points from the support to the held object.
             if contact.meant.is_none() && on_purpose && up >= LEVEL {
                 contact.meant = Some(Purpose::SetDown);
                 self.settling.push((object, below, contact));
@@ -283,8 +282,8 @@ impl Contacts {
         self.hands[arm].parting = Some(Parting { object, set_out: false });
     }
 
-    /// An arm, or the base that carries it, begins to move, with an object in the arm's fingers or without. A grasp in vain is over then:
-    /// what the fingers touch of it from now on is another contact.
+    /// An arm, or the base that carries it, begins to move, with or without an object in the arm's fingers. A failed grasp is over then: contacts of
+    /// the fingers with that object are new contacts from now on.
     pub(super) fn sets_out(&mut self, arm: usize, held: Option<usize>) {
         for (_, contact) in self.waiting_of(arm) {
             self.judge(contact);
@@ -300,17 +299,17 @@ impl Contacts {
         }
     }
 
-    /// From what the fingers of an arm part in the motion that is under way.
+    /// The object that the fingers of an arm leave in the current motion.
     pub(super) fn parts_from(&self, arm: usize) -> Option<usize> {
         self.hands[arm].parting.filter(|parting| parting.set_out).map(|parting| parting.object)
     }
 
-    /// An arm has come to the end of a motion, or its fingers are away from what they part from.
+    /// An arm has reached the end of a motion, or its fingers are away from the object that they leave.
     pub(super) fn parted(&mut self, arm: usize) {
         self.hands[arm].parting = None;
     }
 
-    /// Somebody puts an object somewhere.
+    /// An object is moved by a fault.
     pub(super) fn put(&mut self, object: usize) {
         self.put = Some(object);
         for (_, episode) in self.take(|things, _| things.contains(&Thing::Object(object))) {
@@ -318,7 +317,7 @@ impl Contacts {
         }
     }
 
-    /// The unintended contacts: those that are over, and those that go on or are not judged yet, as it looks now.
+    /// The unintended contacts: those that are over, and those that continue or are not judged yet, by their current state.
     pub(super) fn unintended(&self) -> Vec<Contact> {
         let open = self.open.values().map(|episode| &episode.contact);
         let undecided = open.chain(self.waiting.iter().map(|(_, contact)| contact));
@@ -326,7 +325,7 @@ impl Contacts {
         self.judged.iter().chain(undecided.filter(|contact| contact.is_unintended())).cloned().collect()
     }
 
-    /// The unintended contacts that are over and have not been told yet.
+    /// Takes the unintended contacts that are over and have not been reported yet.
     pub(super) fn tell(&mut self) -> Vec<Contact> {
         std::mem::take(&mut self.fresh)
     }
@@ -355,7 +354,7 @@ impl Contacts {
         }
         let Some(Episode { contact, from, up }) = self.open.get_mut(&touch.things) else { return };
         if contact.meant == Some(Purpose::Stands) && is_moved(&self.arm_links, touch, doing) {
-            // The link leaves, with what stood on it: from here on it is the link that pushes.
+            // The link leaves with the object on it: from now on the link pushes.
             contact.meant = None;
             *from = from.map(|(object, _)| (object, environment.state(object).pose.position));
             (contact.began, contact.depth_m, contact.pushed_m) = (doing.now, 0.0, 0.0);
@@ -381,7 +380,7 @@ impl Contacts {
         }
     }
 
-    /// What a contact is for, where that is known as it begins.
+    /// The purpose of a contact, if it is known at the beginning.
     fn known(&self, touch: &Touch, doing: Doing<'_>) -> Option<Purpose> {
         let just_held = |arm: usize| self.hands[arm].grasped || !doing.arms[arm].is_moved;
         let lifts = |object: usize| {
@@ -409,7 +408,7 @@ impl Contacts {
         }
     }
 
-    /// Judges what was let go where it has come to rest, or begins to be held again.
+    /// Judges the contacts of released objects that have come to rest, or are about to be held again.
     fn settle(&mut self, settles: impl Fn(usize) -> bool, environment: &Environment) {
         let (settled, rest) = std::mem::take(&mut self.settling).into_iter().partition(|(object, ..)| settles(*object));
         self.settling = rest;
@@ -423,21 +422,21 @@ impl Contacts {
         }
     }
 
-    /// What fingers of an arm have touched of which it is not known yet what for; it is taken out.
+    /// Takes out the contacts of an arm's fingers whose purpose is not known yet.
     fn waiting_of(&mut self, arm: usize) -> Vec<(AtObject, Contact)> {
         let (of_arm, rest) = std::mem::take(&mut self.waiting).into_iter().partition(|(at, _)| at.arm == arm);
         self.waiting = rest;
         of_arm
     }
 
-    /// These episodes are over.
+    /// Ends these episodes.
     fn end(&mut self, which: impl Fn(&[Thing; 2], &Episode) -> bool) {
         for (_, episode) in self.take(which) {
             self.judge(episode.contact);
         }
     }
 
-    /// Takes episodes out of those that go on.
+    /// Takes these episodes out of the open ones.
     fn take(&mut self, which: impl Fn(&[Thing; 2], &Episode) -> bool) -> Vec<([Thing; 2], Episode)> {
         let (taken, open) = std::mem::take(&mut self.open).into_iter().partition(|(things, e)| which(things, e));
         self.open = open;
@@ -453,13 +452,13 @@ impl Contacts {
     }
 }
 
-/// Whether it is a link that an arm moves which is on its way.
+/// Whether the touching body is a link of an arm that moves.
 fn is_moved(arm_links: &[Vec<String>], touch: &Touch, doing: Doing<'_>) -> bool {
     let Thing::Link(link) = &touch.things[0] else { return false };
     moving_arm_of(arm_links, link, doing).is_some()
 }
 
-/// Whether an object in the fingers of an arm is touched by what another arm moves, or holds on its way: no object was lifted from that.
+/// Whether another arm moves or carries the body that touches a held object: then the object is not lifted from that body.
 fn is_pushed(arm_links: &[Vec<String>], touch: &Touch, doing: Doing<'_>) -> bool {
     let [other, Thing::Object(object)] = &touch.things else { return false };
     let arm = match other {
@@ -470,7 +469,7 @@ fn is_pushed(arm_links: &[Vec<String>], touch: &Touch, doing: Doing<'_>) -> bool
     arm.is_some() && doing.holder_of(*object).is_some_and(|holder| arm != Some(holder))
 }
 
-/// The arm on its way that moves a link.
+/// The moving arm that moves a link.
 fn moving_arm_of(arm_links: &[Vec<String>], link: &String, doing: Doing<'_>) -> Option<usize> {
     doing.arms.iter().zip(arm_links).position(|(arm, links)| arm.moves && links.contains(link))
 }
@@ -498,12 +497,12 @@ mod tests {
         let waiting = vec![(AtObject { arm: 0, object: 0 }, hit.clone())];
         let mut contacts = Contacts { waiting, ..Contacts::of(&Robot::aimm()) };
         assert_eq!(contacts.unintended(), [hit]);
-        // It was what the fingers came to.
+        // The fingers came to grasp it.
         contacts.closed(0, Some(0), &Watched::new().environment);
         assert_eq!(contacts.unintended().len(), 1, "it was pushed too far for that");
     }
 
-    /// A box in a room of its own, and what watches it.
+    /// A box in free space, and the contacts that are observed.
     struct Watched {
         environment: Environment,
         contacts: Contacts,
@@ -519,7 +518,7 @@ mod tests {
             Watched { environment, contacts }
         }
 
-        /// A step in which the box is `x` metres from where it was and a link is so deep in it, or none is.
+        /// One step in which the box is `x` metres from its first place and overlaps with a link by this depth, or with none.
         fn step(&mut self, x: f64, link: Option<(&str, f64)>, arm_moves: bool, fingers_solid: bool) {
             self.environment.put(0, &Pose::at(2.0 + x, 0.0, 0.5));
             let touch = |(link, depth_m): (&str, f64)| Touch {
@@ -560,7 +559,7 @@ mod tests {
     #[test]
     fn what_stands_on_a_link_of_the_arm_is_pushed_by_it_as_soon_as_the_arm_moves() {
         let mut watched = Watched::new();
-        // It came down on a link that stood still, and slid on it.
+        // The box came down on a standing link, and slid on it.
         watched.step(0.0, Some(("arm_4", 0.0004)), false, true);
         watched.step(0.03, Some(("arm_4", 0.0004)), false, true);
         assert_eq!(watched.pushed_mm(), [0.0; 0]);
@@ -597,7 +596,7 @@ mod tests {
         }
     }
 
-    /// How far a box is pressed when it is grasped, in the direction of a normal that leads out of the table.
+    /// Presses a box while it is grasped, along a normal that points out of the table.
     fn grasped_along(normal: [f64; 3]) -> Vec<Contact> {
         let mut watched = Watched::new();
         let touch = |depth_m: f64| Touch {
@@ -652,7 +651,7 @@ mod tests {
                 contacts.observe(std::slice::from_ref(&touch), doing, &watched.environment, &ids);
                 contacts.unintended().len()
             };
-            // From the first step of its motion on it pushes, and if that is over, it did push.
+            // From the first step of its motion on it pushes, and that remains true when the motion is over.
             assert_eq!([stays, goes, stays].map(&mut unintended_while), [0, 1, 1], "{below:?}");
         }
     }

@@ -1,8 +1,8 @@
-//! What a simulated cell demands of a robot: a workplace, a camera, arms that can be told apart, grippers that can hold the boxes, and room to
-//! stand. The start of a cell refuses a robot that leaves one of them unmet; `ratn robot check` tells all of them before.
+//! What a simulated cell requires of a robot: a workplace, a camera, arms that can be told apart, grippers that can hold the boxes, and free space to
+//! stand in. The cell does not start with a robot that misses a requirement; `ratn robot check` lists all of them beforehand.
 //!
-//! What a description must be for any use (its names, its limits, the kinds of its joints) is checked where it is read. Whether each place of
-//! the workplace can be reached is surveyed (`ratn_motion::survey`); the cell lays objects where they can be.
+//! The requirements for any use of a description (its names, its limits, the kinds of its joints) are checked where it is read. Whether each place of
+//! the workplace can be reached is surveyed (`ratn_motion::survey`); the cell lays objects where they can be reached.
 
 use super::arms::FIRST;
 use super::environment::Furniture;
@@ -19,14 +19,14 @@ use ratn_motion::workplace::{Boxes, HOME, Workplace};
 use std::f64::consts::TAU;
 use std::fmt;
 
-/// A demand that a robot does not meet.
+/// A requirement that a robot does not meet.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Unmet {
-    /// Where to look: a part of the robot.toml, and of which arm.
+    /// Where to look: a part of the robot.toml, and the arm.
     pub place: String,
-    /// What is not as it must be.
+    /// What is wrong.
     pub what: String,
-    /// What the cell needs it for.
+    /// Why the cell needs it.
     pub why: &'static str,
     /// What to do.
     pub next: String,
@@ -39,16 +39,16 @@ impl fmt::Display for Unmet {
     }
 }
 
-/// The most characters of the name of an arm.
+/// Maximum number of characters in the name of an arm.
 const MAX_NAME: usize = 64;
 
-/// A finger may be so far from where it is said to be, in metres: as far as pads give way.
+/// Maximum distance of a finger from its nominal position, in metres: as far as pads give way.
 const FINGER_OFF_M: f64 = 0.002;
 
-/// What stands on something may be so deep in it, in metres: people round.
+/// Maximum overlap of an object with its support, in metres: numbers in descriptions are rounded.
 const STANDS_IN_M: f64 = 0.001;
 
-/// The demands that a robot does not meet in a scene.
+/// The requirements that a robot does not meet in a scene.
 pub fn unmet(robot: &Robot, setting: Setting) -> Vec<Unmet> {
     let mut unmet = Vec::new();
     let Some(workplace) = robot.workplace() else {
@@ -78,7 +78,7 @@ pub fn unmet(robot: &Robot, setting: Setting) -> Vec<Unmet> {
     }
     let (names, standing): (Vec<&str>, _) = (robot.arm_names().collect(), standing(robot, setting));
     for (number, name) in names.iter().enumerate() {
-        // A name that the robot has itself told is one of its arms.
+        // `with_arm` accepts every name that the robot itself lists.
         let Ok(view) = robot.with_arm(name) else { continue };
         let of_arm = if names.len() > 1 { format!(" of the arm `{name}`") } else { String::new() };
         if names.len() > 1 {
@@ -91,13 +91,13 @@ pub fn unmet(robot: &Robot, setting: Setting) -> Vec<Unmet> {
     unmet
 }
 
-/// A base that may not be at the origin.
+/// A base that cannot be at the origin.
 fn away(robot: &Robot) -> Option<Unmet> {
     let ([x, y], heading) = robot.drive_area()?;
     let limits = [("x", Some(x), "m"), ("y", Some(y), "m"), ("its heading", heading, "rad")];
     let leaves_out = |(what, limits, unit): (&'static str, Option<[f64; 2]>, &'static str)| {
         let [low, high] = limits?;
-        // A heading is the same after a whole turn: a drive begins at the one that is within the limits.
+        // A heading is the same after a whole turn: a drive begins with the equivalent one within the limits.
         let origins: &[f64] = if unit == "rad" { &[0.0, TAU, -TAU] } else { &[0.0] };
         (!origins.iter().any(|at| (low..=high).contains(at))).then_some((what, [low, high], unit))
     };
@@ -110,7 +110,7 @@ fn away(robot: &Robot) -> Option<Unmet> {
     })
 }
 
-/// The boxes of an arm: of the first one those of the workplace.
+/// The boxes of an arm: for the first arm those of the workplace.
 fn share<'w>(workplace: &'w Workplace, number: usize, name: &str) -> Option<&'w Boxes> {
     match number {
         FIRST => Some(&workplace.boxes),
@@ -118,7 +118,7 @@ fn share<'w>(workplace: &'w Workplace, number: usize, name: &str) -> Option<&'w 
     }
 }
 
-/// The only arm of a robot is `arm@sim` whatever it is called; this is asked of several.
+/// Checks the name of one of several arms. The only arm of a robot is `arm@sim`, whatever its name.
 fn named(name: &str) -> Option<Unmet> {
     let part_of_id = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
     let is_good = (1..=MAX_NAME).contains(&name.len()) && name.chars().all(part_of_id);
@@ -143,7 +143,7 @@ fn shared(robot: &Robot, [other, arm]: [usize; 2], [other_name, name]: [&str; 2]
     })
 }
 
-/// Why the gripper of an arm cannot hold what the cell has for it. An arm that has no boxes needs no gripper.
+/// Why the gripper of an arm cannot hold the cell's objects. An arm without boxes needs no gripper.
 fn ungrasping(view: &Robot, is_first: bool, boxes: Option<&Boxes>, of_arm: &str) -> Option<Unmet> {
     let unmet = |what: String, why: &'static str, next: &str| {
         Some(Unmet { place: format!("[gripper]{of_arm}"), what, why, next: next.to_owned() })
@@ -176,7 +176,7 @@ fn ungrasping(view: &Robot, is_first: bool, boxes: Option<&Boxes>, of_arm: &str)
     let goes = |way: [f64; 3], y: f64| (way[1] - y).abs().max(way[0].abs()).max(way[2].abs()) <= FINGER_OFF_M;
     let way = ways.iter().find(|(link, _)| *link == finger).map_or([0.0; 3], |(_, way)| *way);
     if !goes(way, outward * opens) {
-        // Adding zero takes the sign from a zero.
+        // Adding zero turns -0 into 0.
         let millimetres = |at: [f64; 3]| {
             let [x, y, z] = at.map(|c| (1e3 * c).round() + 0.0);
             format!("({x:.0}, {y:.0}, {z:.0}) mm")
@@ -257,7 +257,7 @@ fn ungrasping(view: &Robot, is_first: bool, boxes: Option<&Boxes>, of_arm: &str)
     )
 }
 
-/// A finger that does not hang on the hand.
+/// A finger that is not attached to the hand.
 fn off_the_hand(view: &Robot, finger: usize, of_arm: &str) -> Option<Unmet> {
     let (hand, on) = (view.hand()?, view.model.links[finger].parent?);
     let name = |link: usize| &view.model.links[link].name;
@@ -277,7 +277,7 @@ fn holds(pads: &Pads, finger: f64, size: [f64; 3]) -> Result<(), NotGrasped> {
     first.or(second)
 }
 
-/// All furniture.
+/// All furniture, as obstacles.
 fn standing(robot: &Robot, setting: Setting) -> Vec<Obstacle> {
     let parts = |piece: Furniture| piece.parts.into_iter().map(move |part| (piece.name.clone(), part));
     let solid = |(name, (pose, size)): (String, (Pose, [f64; 3]))| Obstacle {
@@ -288,7 +288,7 @@ fn standing(robot: &Robot, setting: Setting) -> Vec<Obstacle> {
     furniture(robot, setting).into_iter().flat_map(parts).map(solid).collect()
 }
 
-/// What the robot stands in, or is in itself, when the cell begins, if that was not said of another arm.
+/// Furniture or links that the robot overlaps with when the cell begins, unless reported for another arm.
 fn in_the_way(view: &Robot, standing: &[Obstacle], of_arm: &str, said: &[Unmet]) -> Vec<Unmet> {
     let touches = view.touches(&first_posture(view), standing);
     let deep = touches.into_iter().filter(|touch| touch.depth_m > STANDS_IN_M);
@@ -313,7 +313,7 @@ fn in_the_way(view: &Robot, standing: &[Obstacle], of_arm: &str, said: &[Unmet])
     deep.map(unmet).filter(|unmet| !said.iter().any(|other| other.what == unmet.what)).collect()
 }
 
-/// Every arm in its posture `home` with open fingers, as the robot seen from an arm has it.
+/// Every arm in its posture `home` with open fingers, as seen from one arm.
 fn first_posture(view: &Robot) -> Configuration {
     let mut first = view.with_all_arms(&view.at_zero());
     for (number, name) in view.arm_names().enumerate() {

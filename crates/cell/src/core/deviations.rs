@@ -1,4 +1,4 @@
-//! What comes of a fault that occurs.
+//! The effects of faults when they occur.
 
 use super::activity::{Activity, Kind as Doing, seconds};
 use super::braking::Way;
@@ -13,17 +13,17 @@ use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use std::f64::consts::PI;
 
-/// How long the camera stays blind, or the robot lost, in the robot's seconds.
+/// How long the camera stays blind, or the robot unlocalised, in the robot's seconds.
 const OUTAGE_S: f64 = 2.0;
-/// Coulomb's coefficient of wet fingers.
+/// Coulomb friction coefficient of wet fingers.
 const SLIPPERY: f64 = 0.02;
-/// How far from all others an object is put, beyond both their radii, in metres: it shall be found and grasped there.
+/// Minimum distance of a moved object from all others, beyond the sum of their radii, in metres: it must be possible to detect and grasp it.
 const APART_M: f64 = 0.05;
-/// Places tried.
+/// Number of places that are tried.
 const MAX_PLACES: usize = 400;
 
 impl Cell {
-    /// Faults whose time has come.
+    /// Applies the faults that are due.
     pub(super) fn deviate(&mut self, out: &mut Vec<Command>) {
         for fault in self.faults.due(self.now) {
             match fault.kind {
@@ -41,7 +41,7 @@ impl Cell {
         }
     }
 
-    /// What is wrong with a picture that was taken since `started`.
+    /// Why a picture that was begun at `started` is unusable, if it is.
     pub(super) fn spoilt_picture(&mut self, started: Timestamp, out: &mut Vec<Command>) -> Option<&'static str> {
         if self.faults.occurs(Kind::SensorDropout).is_some() {
             self.blind_until = self.now;
@@ -63,12 +63,12 @@ impl Cell {
         spoilt
     }
 
-    /// After how long a motion of the arm, of `lasts_s`, breaks off, and why, where it does.
+    /// When a motion of the arm that lasts `lasts_s` breaks off, in seconds, and why, if it does.
     pub(super) fn arm_breaks_off(&mut self, lasts_s: f64) -> Option<(f64, String)> {
         self.faults.occurs(Kind::ControllerAbort).map(|_| (lasts_s / 2.0, GAVE_UP.to_owned()))
     }
 
-    /// The same of a drive.
+    /// The same for a drive.
     pub(super) fn drive_breaks_off(&mut self, lasts_s: f64) -> Option<(f64, String)> {
         let (gave_up, lost) = (self.faults.occurs(Kind::ControllerAbort), self.faults.occurs(Kind::LocalisationLost));
         let reason = if gave_up.is_some() { BASE_GAVE_UP } else { LOST };
@@ -80,19 +80,19 @@ impl Cell {
         self.lost_until > self.now
     }
 
-    /// The controller of the motion under way gives up now; where nothing moves, that of the next motion.
+    /// The controller of the current motion gives up now; if nothing moves, the controller of the next motion.
     fn give_up(&mut self, out: &mut Vec<Command>) {
         let moves_the_arm = |a: &Activity| matches!(a.kind, Doing::Follow(Way::Arm(..)));
         if self.activities.values().any(|a| moves_the_arm(a) || moves_the_base(a)) {
             let why = |a: &Activity| if moves_the_base(a) { BASE_GAVE_UP } else { GAVE_UP };
             self.halt(|a| moves_the_arm(a) || moves_the_base(a), |a| Ending::Aborted(why(a).to_owned()), 1.0, out);
         } else {
-            // There is room: one was just taken out.
+            // There is room: a fault was just taken out.
             self.faults.add(Fault { kind: Kind::ControllerAbort, when: When::Nth(1) });
         }
     }
 
-    /// Somebody takes an object that is still to be fetched and puts it down elsewhere on what it stands on, where it stands apart.
+    /// Moves an object that is still to be fetched to another place on the same support, away from all others.
     fn move_something(&mut self, out: &mut Vec<Command>) {
         let (support, height, regions) = match self.config.scene {
             Setting::Boxes => {
@@ -116,7 +116,7 @@ impl Cell {
             return;
         }
         let object = movable[self.faults.random().random_range(0..movable.len())];
-        // Each arm has as many boxes, the first arm's first: a box stays where its own arm fetches it.
+        // The boxes are divided evenly among the arms, the first arm's first: a box stays where its own arm fetches it.
         let [[x_low, x_high], [y_low, y_high]] = regions[object * regions.len() / self.ids.len()];
         let radius = |i: usize| self.size_of(i)[0].hypot(self.size_of(i)[1]) / 2.0;
         let others: Vec<([f64; 3], f64)> = (0..self.ids.len())
@@ -153,5 +153,5 @@ fn moves_the_base(activity: &Activity) -> bool {
 /// Why a motion ended.
 const GAVE_UP: &str = "the arm's controller gave up: its tracking error was too great; it holds";
 const BASE_GAVE_UP: &str = "the base's controller gave up: its tracking error was too great; it holds";
-/// Why nothing drives.
+/// Why the base does not drive.
 pub(super) const LOST: &str = "the robot does not know where it stands; it holds; localise it before it drives on";

@@ -1,8 +1,8 @@
-//! How wrong the robot is about itself: its encoders, its camera's place on its head, and where its base stands.
+//! The errors of the robot's measurements of itself: its encoders, its camera's pose on the head, and the localisation of its base.
 //!
-//! Controllers and sensors work in *measured* coordinates, and so does everything that the cell tells the robot. What is true follows from
-//! that by the errors here, which are drawn from the seed: those of encoders and camera once, that of the localisation at every stop of the
-//! base. The environment, the judge and the ground truth see only what is true.
+//! Controllers and sensors work in *measured* coordinates, and so does everything that the cell reports to the robot. The true values follow from
+//! them by the errors here, which are drawn from the seed: those of encoders and camera once, those of the localisation at every stop of the base.
+//! The environment, the contact judge and the ground truth use only true values.
 
 use crate::config::ErrorsConfig;
 use rand::{RngExt, SeedableRng};
@@ -12,31 +12,31 @@ use ratn_motion::joint_vector::{JointVector, PerJoint};
 use ratn_motion::robot::Configuration;
 use std::f64::consts::TAU;
 
-/// The errors of one cell: of its encoders, of its camera, and of where its base stands since its last stop.
+/// The errors of one cell: of its encoders, of its camera, and of its base's localisation since the last stop.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Errors {
     config: ErrorsConfig,
     /// The encoders of each arm, in the order of the arms' numbers.
     arms: Vec<Encoders>,
-    /// The true optical frame as seen from where it is said to be.
+    /// The true optical frame in the nominal optical frame.
     camera: Pose,
-    /// Where the base truly stands, as seen from where it believes to: x, y and heading.
+    /// The true pose of the base in the frame of its localised pose: x, y and heading.
     base: [f64; 3],
 }
 
 /// The encoders of an arm.
 #[derive(Debug, Clone, PartialEq)]
 struct Encoders {
-    /// What each reads at its joint's zero, in radians.
+    /// The reading of each encoder at its joint's zero, in radians.
     offsets: JointVector,
-    /// What each reads too much once a turn: amplitude and phase, in radians.
+    /// The periodic error of each encoder, with one period per turn: amplitude and phase, in radians.
     waves: PerJoint<[f64; 2]>,
 }
 
-/// Streams of the seed's generator; faults have the first.
+/// Streams of the seed's generator; faults use stream 1.
 const CALIBRATION: u64 = 2;
 const LOCALISATION: u64 = 3;
-/// The encoders of the arm with the number 1; those of further arms have the streams behind it.
+/// The encoders of arm number 1; further arms use the streams after it.
 const OTHER_ENCODERS: u64 = 4;
 
 impl Encoders {
@@ -55,7 +55,7 @@ impl Encoders {
 }
 
 impl Errors {
-    /// Of a cell with this seed and arms of so many joints each, whose base has come to a stop so many times.
+    /// The errors of a cell with this seed, these numbers of joints per arm, and this number of stops of the base.
     pub(super) fn new(config: ErrorsConfig, joints: &[usize], seed: u64, stops: u64) -> Errors {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         random.set_stream(CALIBRATION);
@@ -74,7 +74,7 @@ impl Errors {
         errors
     }
 
-    /// The base has come to its stop of that number.
+    /// Draws the localisation error for the base's stop of this number.
     pub(super) fn localise(&mut self, seed: u64, stop: u64) {
         let mut random = ChaCha8Rng::seed_from_u64(seed ^ stop.wrapping_mul(0x9E37_79B9_7F4A_7C15));
         random.set_stream(LOCALISATION);
@@ -82,7 +82,7 @@ impl Errors {
         self.base = sigmas.map(|sigma| sigma * normal(&mut random));
     }
 
-    /// Where everything truly is.
+    /// The true configuration for a measured one.
     pub(super) fn truth(&self, measured: &Configuration) -> Configuration {
         let [x, y, heading] = measured.base;
         let [ahead, left, turn] = self.base;
@@ -97,7 +97,7 @@ impl Errors {
         truth
     }
 
-    /// Where the base believes to be when it truly is there.
+    /// The localised pose of the base for a true one.
     pub(super) fn believed(&self, base: [f64; 3]) -> [f64; 3] {
         let [ahead, left, turn] = self.base;
         let heading = base[2] - turn;
@@ -105,13 +105,13 @@ impl Errors {
         [base[0] - (cos * ahead - sin * left), base[1] - (sin * ahead + cos * left), heading]
     }
 
-    /// The true optical frame, of one that would be at `nominal` were the calibration right.
+    /// The true optical frame for a nominal one.
     pub(super) fn eye(&self, nominal: &Pose) -> Pose {
         if self.camera == Pose::IDENTITY { *nominal } else { nominal.compose(&self.camera) }
     }
 }
 
-/// A standard normal (Box and Muller 1958).
+/// A standard normal sample (Box and Muller 1958).
 fn normal(random: &mut ChaCha8Rng) -> f64 {
     let (radius, angle): (f64, f64) = (random.random_range(f64::MIN_POSITIVE..1.0), random.random_range(0.0..TAU));
     (-2.0 * radius.ln()).sqrt() * angle.cos()
@@ -133,7 +133,7 @@ mod tests {
         (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt()
     }
 
-    /// Of as many samples as there are here the root mean square is within 10 % of the deviation, with hardly an exception.
+    /// For the number of samples in these tests, the root mean square is within 10 % of the standard deviation almost always.
     fn about(value: f64, sigma: f64) -> bool {
         (value / sigma - 1.0).abs() < 0.1
     }
@@ -147,7 +147,7 @@ mod tests {
         assert!(about(rms(truths.iter().map(|t| t.base[2] - 1.0)), config.localisation_rad));
         let off = |t: &Configuration| (t.base[0] - 0.3).hypot(t.base[1] + 0.2) / 2.0_f64.sqrt();
         assert!(about(rms(truths.iter().map(off)), config.localisation_m));
-        // A wave has its amplitude's deviation times the root of a half, in the mean over phases.
+        // The standard deviation of the periodic error, averaged over phases, is that of its amplitude times √½.
         let encoder = config.encoder_rad.hypot(config.encoder_wave_rad / 2.0_f64.sqrt());
         assert!(about(rms(truths.iter().flat_map(|t| t.arm.to_vec())), encoder));
         let eyes: Vec<Pose> = all.iter().map(|errors| errors.eye(&Pose::at(0.0, 0.0, 1.6))).collect();

@@ -1,8 +1,7 @@
-//! What goes wrong in the cell on request: by a schedule, or by chance from the cell's seed.
+//! Faults that are injected into the cell: by a schedule, or at random from the cell's seed.
 //!
-//! A [`Fault`] has a kind and says when: at the n-th occasion (`grasp_slips:2` is the second grasp), at a time of the robot
-//! (`object_moved@12.5`), or at every occasion with a chance (`sensor_dropout~0.05`). The occasions are counted here; what comes of
-//! a fault is in `deviations`.
+//! A [`Fault`] has a kind and a time: at the n-th occasion (`grasp_slips:2` is the second grasp), at a time of the robot (`object_moved@12.5`), or at
+//! every occasion with a probability (`sensor_dropout~0.05`). The occasions are counted here; the effects of faults are in `deviations`.
 
 use super::activity::seconds;
 use rand::{RngExt, SeedableRng};
@@ -19,13 +18,13 @@ pub const MAX_FAULTS: usize = 64;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
-    /// The fingers lose what they close around; at a time: what they hold by then slides out. Occasion: a grasp that holds something.
+    /// The fingers lose the object that they close around; at a time: the held object slides out. Occasion: a grasp that holds something.
     GraspSlips,
-    /// Somebody puts an object elsewhere on the table. Occasion: a picture was taken.
+    /// An object is moved to another place on the table. Occasion: a picture was taken.
     ObjectMoved,
     /// The camera gives no image; at a time: for a while. Occasion: a picture.
     SensorDropout,
-    /// A controller gives up half-way. Occasion: a motion of the arm or of the base.
+    /// A controller gives up halfway. Occasion: a motion of the arm or of the base.
     ControllerAbort,
     /// The robot does not know where it stands, for a while: no picture can be placed in the world, and it does not drive.
     /// Occasion: a picture, or a drive.
@@ -35,7 +34,7 @@ pub enum Kind {
 /// When something goes wrong.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum When {
-    /// At the n-th occasion from now on, 1 and up.
+    /// At the n-th occasion from now on, counted from 1.
     Nth(u32),
     /// At this time of the robot, in seconds since the cell began.
     At(f64),
@@ -63,7 +62,7 @@ pub struct FaultError {
     pub text: String,
 }
 
-/// The faults that are still to come.
+/// The faults that are still to occur.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Faults {
     coming: Vec<Fault>,
@@ -71,7 +70,7 @@ pub(super) struct Faults {
 }
 
 impl Kind {
-    /// All of them.
+    /// All kinds.
     pub const ALL: [Kind; 5] =
         [Kind::GraspSlips, Kind::ObjectMoved, Kind::SensorDropout, Kind::ControllerAbort, Kind::LocalisationLost];
 
@@ -89,37 +88,37 @@ impl Kind {
 
 impl Faults {
     pub(super) fn new(coming: &[Fault], seed: u64) -> Faults {
-        // Another stream than that of the table.
+        // The table uses another random stream.
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         random.set_stream(1);
         Faults { coming: coming.to_vec(), random }
     }
 
-    /// What it can be made of again: what is to come, and how many words were drawn.
+    /// The state for [`Faults::restore`]: the faults to come, and the number of words drawn from the generator.
     pub(super) fn save(&self) -> (Vec<Fault>, u64) {
         (self.coming.clone(), u64::try_from(self.random.get_word_pos()).unwrap_or(u64::MAX))
     }
 
-    /// As it was saved.
+    /// Restores a saved state.
     pub(super) fn restore(coming: &[Fault], seed: u64, drawn: u64) -> Faults {
         let mut faults = Faults::new(coming, seed);
         faults.random.set_word_pos(drawn.into());
         faults
     }
 
-    /// One more; none beyond [`MAX_FAULTS`].
+    /// Adds a fault, unless there are [`MAX_FAULTS`].
     pub(super) fn add(&mut self, fault: Fault) {
         if self.coming.len() < MAX_FAULTS {
             self.coming.push(fault);
         }
     }
 
-    /// How many are still to come.
+    /// Number of faults that are still to occur.
     pub(super) fn len(&self) -> usize {
         self.coming.len()
     }
 
-    /// An occasion for a fault of this kind: whether it occurs.
+    /// Counts an occasion for faults of this kind; returns the fault that occurs.
     pub(super) fn occurs(&mut self, kind: Kind) -> Option<Fault> {
         let mut occurring = None;
         for fault in self.coming.iter_mut().filter(|fault| fault.kind == kind) {
@@ -142,12 +141,12 @@ impl Faults {
         occurring
     }
 
-    /// When the next scheduled one is due.
+    /// When the next fault with a fixed time is due.
     pub(super) fn next(&self) -> Option<Timestamp> {
         self.coming.iter().filter_map(Fault::at).min()
     }
 
-    /// Those due by `now`, each once.
+    /// Takes the faults that are due by `now`.
     pub(super) fn due(&mut self, now: Timestamp) -> Vec<Fault> {
         let is_due = |fault: &Fault| fault.at().is_some_and(|at| at <= now);
         let due = self.coming.iter().copied().filter(is_due).collect();
@@ -155,7 +154,7 @@ impl Faults {
         due
     }
 
-    /// What chance is drawn from.
+    /// The random generator of faults.
     pub(super) fn random(&mut self) -> &mut ChaCha8Rng {
         &mut self.random
     }

@@ -1,10 +1,10 @@
-//! What is between the fingers, really.
+//! What the fingers really hold.
 //!
-//! The pads of the two fingers sweep a cuboid of the tool frame when they close (along y). What they can close around of an object is a
-//! cuboid, too (`Model::grip_part`): a box, the wall of a bowl. It is grasped when two of its
-//! opposite faces are roughly across that direction, all of it that the pads would meet is between them, and the pads meet
-//! enough of it. Closing then turns and shifts it until its faces are flush with the pads: compliant objects and rigid
-//! fingers do that, so a pose that was off by millimetres ends exactly in the middle.
+//! When they close, the pads of the two fingers sweep a cuboid of the tool frame, along y. The part of an object that they can close around is a
+//! cuboid, too (`Model::grip_part`): a box, the wall of a bowl. It is grasped when two of its opposite faces are roughly perpendicular to that
+//! direction, everything of it that the pads would meet is between them, and the pads cover enough of it. Closing then rotates and shifts it until
+//! its faces are flush with the pads: rigid fingers do that to objects that give way, so a pose that was off by millimetres ends exactly in the
+//! middle.
 
 use ratn_model::pose::Pose;
 use ratn_motion::robot::{FingerPart, Robot};
@@ -12,69 +12,69 @@ use ratn_motion::robot::{FingerPart, Robot};
 /// The fingers' pads, in the tool frame, in metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pads {
-    /// Their least and greatest x.
+    /// Minimum and maximum x.
     pub x: [f64; 2],
-    /// From here along z (the palm's side)
+    /// Minimum z (the palm's side).
     pub z_from: f64,
-    /// to here (the tips).
+    /// Maximum z (the tips).
     pub z_to: f64,
-    /// How thick the fingers are behind them.
+    /// Thickness of the fingers behind the pads.
     pub thick: f64,
 }
 
 /// A grasp.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Grip {
-    /// The index of the cuboid that is held, among those that were given.
+    /// The index of the held cuboid in the input.
     pub index: usize,
     /// The opening at which the fingers stopped, in metres.
     pub width: f64,
-    /// The cuboid's centre in the tool frame, once the fingers have closed.
+    /// The cuboid's pose in the tool frame after the fingers have closed.
     pub in_tool: Pose,
 }
 
-/// Why closing the fingers holds nothing.
+/// Why the fingers hold nothing after closing.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum NotGrasped {
     /// No object is there.
     #[error("nothing is between the fingers")]
     Nothing,
-    /// It is turned too far to lie flush with the pads.
+    /// The object is rotated too far to lie flush with the pads.
     #[error("{id} stands {degrees:.0}° askew between the fingers; at most {MAX_ASKEW_DEGREES}° is taken")]
     Askew {
-        /// Which object.
+        /// The object.
         id: String,
-        /// How much.
+        /// Its angle, in degrees.
         degrees: f64,
     },
-    /// A finger would close inside of it, or beside it.
+    /// A finger would close inside of the object, or beside it.
     #[error("{id} is not between the fingers: it reaches {beyond_mm:.0} mm beyond one of them")]
     Beyond {
-        /// Which object.
+        /// The object.
         id: String,
-        /// How far.
+        /// How far it reaches beyond a finger, in millimetres.
         beyond_mm: f64,
     },
-    /// Only an edge of it is between the pads.
+    /// Only an edge of the object is between the pads.
     #[error("the fingers hold only an edge of {id}: {held_mm:.0} mm of it, at least {:.0} mm are needed", MIN_HOLD_M * 1e3)]
     Edge {
-        /// Which object.
+        /// The object.
         id: String,
-        /// How much.
+        /// The length that the pads hold, in millimetres.
         held_mm: f64,
     },
     /// Two objects are between the fingers.
     #[error("{first} and {second} are both between the fingers")]
     Several {
-        /// One.
+        /// The first object.
         first: String,
-        /// The other.
+        /// The second object.
         second: String,
     },
 }
 
 impl NotGrasped {
-    /// The object that the fingers closed at; of several, the first.
+    /// The object that the fingers closed at; the first one if there are several.
     pub fn object(&self) -> Option<&str> {
         match self {
             NotGrasped::Nothing => None,
@@ -84,21 +84,21 @@ impl NotGrasped {
     }
 }
 
-/// How far a cuboid may be turned away from the closing direction.
+/// Maximum angle between a cuboid's axis and the closing direction.
 pub const MAX_ASKEW_DEGREES: f64 = 15.0;
-/// How much of it the pads must hold, along x and along z.
+/// Minimum length of the cuboid that the pads must hold, along x and along z.
 pub const MIN_HOLD_M: f64 = 0.008;
 /// How far the pads give way, in metres.
 const PAD_GIVE_M: f64 = 0.002;
 
 impl Pads {
-    /// The pads of a robot's gripper. `None` where no box of the finger lies along the tool's axes.
+    /// The pads of a robot's gripper. `None` if no box of the finger is aligned with the tool's axes.
     pub fn of(robot: &Robot) -> Option<Pads> {
         let FingerPart { middle: [x, _, z], half, .. } = Pads::part(robot)?;
         Some(Pads { x: [x - half[0], x + half[0]], z_from: z - half[2], z_to: z + half[2], thick: 2.0 * half[1] })
     }
 
-    /// Of the boxes of a finger that lie along the tool's axes, the one that is nearest to the other finger where both meet.
+    /// The finger's box that is nearest to the other finger where both meet, among the boxes aligned with the tool's axes.
     pub(super) fn part(robot: &Robot) -> Option<FingerPart> {
         let inner_m = |part: &FingerPart| part.middle[1].abs() - part.half[1];
         let boxes = robot.finger_parts().into_iter().filter(|part| part.is_flat);
@@ -125,8 +125,7 @@ impl Pads {
         grip.ok_or(NotGrasped::Nothing)
     }
 
-    /// What of a cuboid lies between the closed pads: least and greatest x and z of the tool frame. `None` where that is too little to
-    /// hold it.
+    /// The part of a cuboid between the closed pads: minimum and maximum x and z in the tool frame. `None` if it is too small to be held.
     pub fn patch(&self, in_tool: &Pose, size: &[f64; 3]) -> Option<[[f64; 2]; 2]> {
         let axes = axes(in_tool);
         let across = (0..3).max_by(|a, b| axes[*a][1].abs().total_cmp(&axes[*b][1].abs())).unwrap_or(1);
@@ -143,8 +142,8 @@ impl Pads {
         self.meets(finger + self.thick, in_tool, size)
     }
 
-    /// Whether a cuboid is in the one that the pads sweep when they close from `finger` metres on each side of the middle: whether no axis of
-    /// either separates the two.
+    /// Whether a cuboid overlaps with the one that the pads sweep when they close from `finger` metres on each side of the middle: no axis of either
+    /// separates the two.
     pub fn meets(&self, finger: f64, in_tool: &Pose, size: &[f64; 3]) -> bool {
         let [x_from, x_to] = self.x;
         let half = [(x_to - x_from) / 2.0, finger, (self.z_to - self.z_from) / 2.0];
@@ -188,12 +187,12 @@ impl Pads {
     }
 }
 
-/// Where something is in the tool frame after the fingers have closed around it, `width` metres apart, by what was believed before and by
-/// what two fingers measure.
+/// The pose of an object in the tool frame after the fingers have closed around it, `width` metres apart, from the pose estimate before and from what
+/// two fingers measure.
 ///
-/// That is the width, and that there is something. Where the middle of what was believed is between the pads, its faces are flush with them
-/// and it is in their middle: one position and the turns about the two other axes. Where it is not, as of a bowl that is held by its rim,
-/// nothing follows from the width. Whatever else was wrong, along the fingers and about the axis on which they close, nobody has measured.
+/// They measure the width, and that there is something. If the centre of the estimated pose is between the pads, the object's faces are flush with
+/// them and it is centred: this gives one position and the rotations about the two other axes. If it is not, as for a bowl that is held by its rim,
+/// nothing follows from the width. Errors along the fingers, and about the axis on which they close, remain unmeasured.
 pub fn felt(believed: &Pose, width: f64) -> Pose {
     if believed.position[1].abs() > width / 2.0 {
         return *believed;
@@ -201,17 +200,17 @@ pub fn felt(believed: &Pose, width: f64) -> Pose {
     let axes = axes(believed);
     let across = (0..3).max_by(|a, b| axes[*a][1].abs().total_cmp(&axes[*b][1].abs())).unwrap_or(1);
     if axes[across][1].abs() < MAX_ASKEW_DEGREES.to_radians().cos() {
-        // It is round, or something else than believed: how it is turned cannot be felt.
+        // The object is round, or not the estimated one: its rotation cannot be felt.
         let [x, _, z] = believed.position;
         return Pose { position: [x, 0.0, z], ..*believed };
     }
     flush(believed, axes[across])
 }
 
-/// The pose after closing: the axis that lay roughly along ±y lies exactly so, and the cuboid is in the middle.
+/// The pose after closing: the axis that was roughly along ±y is exactly so, and the cuboid is centred.
 fn flush(in_tool: &Pose, axis: [f64; 3]) -> Pose {
     let side = axis[1].signum();
-    // The rotation that takes `axis` to ±y: about their cross product, by the angle between them.
+    // The rotation from `axis` to ±y: about their cross product, by the angle between them.
     let turn = [-axis[2] * side, 0.0, axis[0] * side];
     let sine = (turn[0] * turn[0] + turn[2] * turn[2]).sqrt();
     let mut pose = *in_tool;
@@ -239,7 +238,7 @@ mod tests {
     const PADS: Pads = Pads { x: [-0.0125, 0.0125], z_from: -0.055, z_to: 0.015, thick: 0.014 };
     const SIZE: [f64; 3] = [0.12, 0.07, 0.10];
 
-    /// The tool looks down from 3 cm below the top of a box at the origin.
+    /// The tool points down from 3 cm below the top of a box at the origin.
     fn tool() -> Pose {
         Pose::from_rpy([0.0, 0.0, 0.02], PI, 0.0, 0.0)
     }
@@ -287,10 +286,10 @@ mod tests {
         let felt_box = felt(&believed, 0.07);
         assert_eq!(felt_box.position, [0.02, 0.0, 0.004], "only the offset across the fingers is known to be none");
         assert!(felt_box.rotate([0.0, 1.0, 0.0])[1].abs() > 1.0 - 1e-12, "a box lies flush");
-        // A cup that is seen from its side is as good as any other: its yaw is left alone.
+        // A cup looks the same from all sides: its yaw is not changed.
         let round = Pose::from_rpy([0.02, 0.006, 0.004], PI, 0.0, 0.7);
         assert_eq!(felt(&round, 0.07), Pose { position: [0.02, 0.0, 0.004], ..round });
-        // A bowl by its wall: nobody knows how far its middle is from there.
+        // A bowl that is held by its wall: the distance of its centre is not known.
         let bowl = Pose::from_rpy([0.0, 0.06, 0.01], PI, 0.0, 0.0);
         assert_eq!(felt(&bowl, 0.005), bowl);
     }
@@ -303,7 +302,7 @@ mod tests {
         };
         // The tips are 15 mm below the tool, the top of the box is 30 mm above it.
         assert!(at(0.0, 0.0) && at(0.04, 0.0) && !at(0.05, 0.0));
-        // A finger that is all in it, and one that is beside it.
+        // A finger fully inside the box, and one beside it.
         assert!(at(0.0, 0.055 + 0.014) && !at(0.0, 0.035 + 0.055 + 0.015));
     }
 

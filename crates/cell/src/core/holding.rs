@@ -11,62 +11,62 @@ use super::protocol::{Command, Ending, Product};
 use ratn_model::pose::Pose;
 use ratn_motion::workplace::Surface;
 
-/// What the fingers are closed around.
+/// The object that the fingers hold.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Held {
     pub(super) object: usize,
     pub(super) in_tool: Pose,
     slip: Slip,
     friction: f64,
-    /// Where the tool was at the last two steps, the last one last.
+    /// Positions of the tool at the last two steps, the newest last.
     trail: [Option<[f64; 3]>; 2],
-    /// The tool stood still and it did not slip.
+    /// The tool stood still and the object did not slip.
     steady: bool,
 }
 
 /// A part of an object, in the object's frame, and its edges in metres.
 type Cuboid = (Pose, [f64; 3]);
 
-/// How far something may lean and still stand as it was made to.
+/// Maximum lean of an object that stands upright.
 const MAX_LEAN_RAD: f64 = 0.2;
-/// How far from the middle of its place a delivered object may stand, in metres.
+/// Maximum distance of a delivered object from the middle of its place, in metres.
 const MAX_OFF_PLACE_M: f64 = 0.03;
 
 impl Held {
-    /// Around an object that does not slip.
+    /// A hold of an object that does not slip.
     pub(super) fn new(object: usize, in_tool: Pose, friction: f64) -> Held {
         Held { object, in_tool, slip: Slip::default(), friction, trail: [None; 2], steady: false }
     }
 
-    /// What it can be made of again.
+    /// The state for restoring the hold.
     pub(super) fn save(&self) -> (usize, Pose, f64) {
         (self.object, self.in_tool, self.friction)
     }
 
-    /// Whether it stays where it is as long as the tool does.
+    /// Whether the object does not move relative to the tool as long as the tool stands.
     pub(super) fn is_steady(&self) -> bool {
         self.steady
     }
 
-    /// The fingers are as slippery as that from now on.
+    /// Sets the friction of the fingers from now on.
     pub(super) fn set_friction(&mut self, friction: f64) {
         (self.friction, self.steady) = (friction, false);
     }
 }
 
 impl Cell {
-    /// How far each finger of an arm is from the middle when something between them stops them, if something does.
+    /// Distance of each finger of an arm from the middle when an object between them stops them; 0 without one.
     ///
     /// # Errors
-    /// Where that is held by another arm.
+    /// If that object is held by another arm.
     pub(super) fn closes_to(&self, arm: usize, from: f64) -> Result<f64, String> {
         let tools = self.arms.tools(&self.configuration());
         let (parts, closed) = self.between(arm, from, &tools);
         self.held_by_another(arm, from, &parts, &tools).map_or(Ok(closed.map_or(0.0, |grip| grip.width / 2.0)), Err)
     }
 
-    /// Why fingers of an arm do not close where something is between them that another arm holds, whether they would hold it or not: what two
-    /// grippers do to one object is not simulated. `parts` are those of [`Cell::between`].
+    /// Why the fingers of an arm do not close if an object between them is held by another arm, whether they would hold it or not: two grippers on
+    /// one object are not simulated. `parts` are those of [`Cell::between`].
     fn held_by_another(&self, arm: usize, from: f64, parts: &[Cuboid], tools: &[Pose]) -> Option<String> {
         let (pads, seen) = (self.arms.pads(arm)?, tools[arm].inverse());
         let held = |(object, (part, size)): (usize, &Cuboid)| {
@@ -83,7 +83,7 @@ impl Cell {
         ))
     }
 
-    /// Of every object the part that fingers of an arm could close around, and what they hold when they close from `from`.
+    /// For every object the part that the fingers of an arm could close around, and what they hold when they close from `from`.
     fn between(&self, arm: usize, from: f64, tools: &[Pose]) -> (Vec<Cuboid>, Result<GripOf, NotGrasped>) {
         let tool = &tools[arm];
         let parts: Vec<Cuboid> =
@@ -95,9 +95,8 @@ impl Cell {
         (parts, closed)
     }
 
-    /// The fingers of an arm have closed from `from` metres on each side of the middle. The goal's result says what fingers can measure: how wide
-    /// the thing was that stopped them, and whether it still does. Why they hold nothing only the cell knows: that is a
-    /// [`Command::Noted`].
+    /// The fingers of an arm have closed from `from` metres on each side of the middle. The goal's result has what fingers can measure: the width of
+    /// the object that stopped them, and whether it still does. Only the cell knows why they hold nothing: that is a [`Command::Noted`].
     pub(super) fn close(
         &mut self,
         arm: usize,
@@ -154,7 +153,7 @@ impl Cell {
         Ending::Done(Product::Grasped { object, width: grip.width, in_gripper })
     }
 
-    /// The fingers of an arm open: what they held is left to itself.
+    /// The fingers of an arm open and release the object that they held.
     pub(super) fn let_go(&mut self, arm: usize) {
         let Some(held) = self.arms.hold(arm, None) else { return };
         self.contacts.let_go(arm, held.object, true);
@@ -162,7 +161,7 @@ impl Cell {
         self.environment.let_go(held.object, &tool.compose(&held.in_tool), [0.0; 3]);
     }
 
-    /// One step in which an arm holds what it holds, with its tool where it is now; the object that was lost.
+    /// One step of an arm's hold, with its tool at its current pose; returns the object if it was lost.
     pub(super) fn keep_hold(&mut self, arm: usize, tool: &Pose) -> Option<usize> {
         let mut held = self.arms.held(arm)?;
         let dt = STEP.as_secs_f64();
@@ -207,13 +206,13 @@ impl Cell {
         Some(held.object)
     }
 
-    /// Whether an object is between the fingers of an arm, or in one of them, with the tools at `tools`.
+    /// Whether an object is between the fingers of an arm, or overlaps with one of them, with the tools at `tools`.
     pub(super) fn fingers_are_at(&self, arm: usize, object: usize, tools: &[Pose], finger: f64) -> bool {
         let in_tool = tools[arm].inverse().compose(&self.pose_of(object, tools));
         self.arms.pads(arm).is_some_and(|pads| pads.are_at(finger, &in_tool, &self.size_of(object)))
     }
 
-    /// What the fingers can close around of an object that is there in the tool frame.
+    /// The part of an object that the fingers can close around, for its pose in the tool frame.
     fn grip_part(&self, object: usize, in_tool: &Pose) -> (Pose, [f64; 3]) {
         self.environment.model(object).grip_part(&in_tool.inverse())
     }
@@ -223,7 +222,7 @@ impl Cell {
         self.environment.model(object).size
     }
 
-    /// Where an object is, with the tools of all arms at `tools`.
+    /// The pose of an object, with the tools of all arms at `tools`.
     pub(super) fn pose_of(&self, object: usize, tools: &[Pose]) -> Pose {
         match self.arms.holder_of(object) {
             Some((arm, held)) => tools[arm].compose(&held.in_tool),
@@ -231,7 +230,7 @@ impl Cell {
         }
     }
 
-    /// On what an object rests; empty where on nothing.
+    /// The name of the support of an object; empty without a support.
     pub(super) fn support_of(&self, object: usize) -> String {
         match self.environment.rests_on(object) {
             Some(Support::Named(name)) => name.to_owned(),
@@ -240,7 +239,7 @@ impl Cell {
         }
     }
 
-    /// Whether an object stands at one of the places that boxes are brought to, on whichever of its faces: a box has no top.
+    /// Whether an object stands at one of the places for delivered boxes, on any of its faces: a box has no top.
     pub(super) fn is_delivered(&self, pose: &Pose, on: &str) -> bool {
         let upright = |axis: usize| pose.rotate(unit(axis))[2].abs() >= MAX_LEAN_RAD.cos();
         placement::workplace(&self.robot).shares().any(|(_, places)| {
@@ -258,7 +257,7 @@ fn unit(axis: usize) -> [f64; 3] {
     std::array::from_fn(|i| f64::from(u8::from(i == axis)))
 }
 
-/// The two edges that lie across the closing direction.
+/// The two edges perpendicular to the closing direction.
 fn across(in_tool: &Pose, size: &[f64; 3]) -> [f64; 2] {
     let along = |k: usize| in_tool.rotate(unit(k))[1].abs();
     match (0..3).max_by(|a, b| along(*a).total_cmp(&along(*b))) {

@@ -1,36 +1,36 @@
-//! How far the links of a part move at the most where its joints do, and ways of which only so many postures are kept.
+//! Upper bounds of how far the links of a part move when its joints do, and motions that are reduced to a limited number of postures.
 //!
-//! A controller's course has a posture every few milliseconds. Of a slow motion those are many that hardly differ, and how slow a motion is says
-//! nothing of what is in its way: such a way is thinned.
+//! A controller's course has a posture every few milliseconds. In a slow motion many of them hardly differ, and the speed of a motion says nothing
+//! about its obstacles: such a motion is thinned.
 
 use super::clearance::Part;
 use ratn_model::pose::Pose;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{ArmPosition, Robot};
 
-/// How far anything may be from where it is in the nearest posture that is kept, in metres: at first,
+/// Allowed distance of any point from its position in the nearest posture that is kept, in metres: at first,
 const FINEST_M: f64 = 0.001;
-/// and at the most, where there would be too many of them else.
+/// and at most, if there would be too many postures otherwise.
 const COARSEST_M: f64 = 0.008;
 
-/// How far the bodies of a part move at the most where its joints do: by length of all links between, so in every posture.
+/// Upper bounds of the motion of a part's bodies per joint motion: by the length of all links between, so they hold in every posture.
 pub(super) struct Levers {
-    /// In metres per radian, or per metre of a joint that slides.
+    /// In metres per radian, or per metre for a prismatic joint.
     joints: Vec<f64>,
     /// In metres per metre of the fingers.
     finger: f64,
 }
 
-/// A way of which only some postures are kept.
+/// A motion of which only some postures are kept.
 #[derive(Debug, Clone)]
 pub(super) struct Thinned {
     pub(super) way: Vec<JointVector>,
-    /// How far anything may be from where it is in the nearest of them, in metres.
+    /// Maximum distance of any point from its position in the nearest kept posture, in metres.
     pub(super) beside_m: f64,
 }
 
 impl Levers {
-    /// Of the bodies of these links of a part.
+    /// The bounds for the bodies of these links of a part.
     pub(super) fn of(robot: &Robot, part: Part, of_part: &[usize]) -> Levers {
         let links = &robot.model.links;
         let joints: Vec<Option<usize>> =
@@ -67,7 +67,7 @@ impl Levers {
         levers
     }
 
-    /// No point of any body is farther from where it is at another position than that, in metres.
+    /// Upper bound of the distance that any point of any body moves between two positions, in metres.
     pub(super) fn moved(&self, from: &ArmPosition, to: &ArmPosition) -> f32 {
         (self.moved_by_joints(&from.joints, &to.joints) + self.finger * (to.finger - from.finger).abs()) as f32
     }
@@ -76,7 +76,7 @@ impl Levers {
         self.joints.iter().enumerate().map(|(j, by)| by * (to[j] - from[j]).abs()).sum()
     }
 
-    /// Postures of a way that stand for all of it: at most so many, unless those are more than [`COARSEST_M`] apart.
+    /// Postures that represent a whole motion: at most `most`, unless those are more than [`COARSEST_M`] apart.
     pub(super) fn thinned(&self, way: &[JointVector], most: usize) -> Thinned {
         let mut apart_m = FINEST_M;
         loop {
@@ -88,7 +88,7 @@ impl Levers {
         }
     }
 
-    /// The first posture, the last one, and every one in which something is farther than that from where it was in the one kept before.
+    /// The first posture, the last one, and every one in which a point may have moved farther than `apart_m` since the last kept one.
     fn kept(&self, way: &[JointVector], apart_m: f64) -> Thinned {
         let mut thinned = Thinned { way: Vec::new(), beside_m: 0.0 };
         for (i, posture) in way.iter().enumerate() {
@@ -109,7 +109,7 @@ mod tests {
     use super::*;
     use ratn_motion::robot::Configuration;
 
-    /// Points of all bodies of the arm: where each begins, and one of its own size off that.
+    /// Points of all bodies of the arm: the origin of each, and points at its radius along the axes.
     fn corners(robot: &Robot, at: &ArmPosition) -> Vec<[f64; 3]> {
         let poses = robot.poses(&Configuration { arm: at.joints, finger: at.finger, ..robot.at_zero() });
         let bodies = robot
@@ -175,7 +175,7 @@ mod tests {
                 assert!(from_kept.fold(f64::INFINITY, f64::min) <= slow.beside_m + 1e-9);
             }
         }
-        // A way of long steps is as it is.
+        // A motion with long steps is not changed.
         let coarse = levers.thinned(&way(20), 100_000);
         assert_eq!((coarse.way, coarse.beside_m), (way(20), 0.0));
     }

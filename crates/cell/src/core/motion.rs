@@ -1,63 +1,62 @@
-//! A trajectory that is being followed, and how well.
+//! A trajectory that a controller follows, and its tracking errors.
 //!
-//! The joints are driven by a controller that sees where they are and where the trajectory has them: each is a critically damped
-//! second-order system with the trajectory's velocity fed forward, a = ω²(x* − x) + 2ω(v* − v). It lags by about x*″ / ω² while the
-//! trajectory accelerates. A motion is over when the joints have settled at the trajectory's end, where the brakes close; it breaks
-//! off where they are too far from it, and brakes (`braking`). All of that follows from the trajectory alone, so it is worked out when the motion
-//! starts.
+//! A controller drives the joints by their positions and those of the trajectory: each joint is a critically damped second-order system with the
+//! trajectory's velocity fed forward, a = ω²(x* − x) + 2ω(v* − v). It lags by about x*″ / ω² while the trajectory accelerates. A motion is over when
+//! the joints have settled at the trajectory's end, where the brakes close; it breaks off and brakes (`braking`) if they are too far from the
+//! trajectory. All of this follows from the trajectory alone, so it is computed when the motion starts.
 
 use super::environment::STEP;
 use ratn_motion::joint_vector::{JointVector, PerJoint};
 use ratn_motion::trajectory::Curve;
 use serde::{Deserialize, Serialize};
 
-/// Joints on their way along a trajectory.
+/// Joints that follow a trajectory.
 #[derive(Debug, Clone)]
 pub(crate) struct Motion {
     trajectory: Curve,
-    /// Where the joints are, every [`STEP`] from the start.
+    /// The joint positions, every [`STEP`] from the start.
     course: Vec<JointVector>,
-    /// Which of the joints slide.
+    /// Which of the joints are prismatic.
     slides: PerJoint<bool>,
-    /// When it ends before it is done, and why.
+    /// When and why the motion ends early, if it does.
     breaks: Option<(f64, String)>,
 }
 
-/// How a controller drives joints.
+/// The controller of joints.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Controller {
-    /// Whose it is.
+    /// The name of the part that it drives.
     pub(crate) of: &'static str,
-    /// ω, in radians per second.
+    /// Maximum distance of the joints from their trajectory, in radians and in metres.
     pub(crate) stiffness: f64,
-    /// How far the joints may be from their trajectory, in radians and in metres.
+    /// Which of the joints are prismatic.
     pub(crate) most_off: f64,
     /// Which of the joints slide.
     pub(crate) slides: PerJoint<bool>,
 }
 
-/// How far joints were from a trajectory while they followed it.
+/// Distances of joints from their trajectory while they followed it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Tracking {
-    /// Those that turn, in radians: any of them at the most.
+    /// Maximum over all revolute joints, in radians.
     pub most_rad: f64,
-    /// The root of the mean square over all of them and all the time.
+    /// Root mean square over all revolute joints and the whole time.
     pub rms_rad: f64,
-    /// Those that slide, in metres: their distance at the most.
+    /// Maximum distance of the prismatic joints, in metres.
     pub most_m: f64,
-    /// The root of its mean square over all the time.
+    /// Root mean square of that distance over the whole time.
     pub rms_m: f64,
 }
 
-/// What counts as there, in radians and in metres: what a joint's encoder can tell.
+/// Distance that counts as reached, in radians and in metres: the resolution of an encoder.
 const SETTLED: f64 = 1e-5;
-/// What counts as standing, per second.
+/// Speed that counts as standstill, per second.
 const STANDING: f64 = 1e-3;
-/// How long joints may take to settle, in seconds.
+/// Maximum time for joints to settle, in seconds.
 const MAX_SETTLING_S: f64 = 5.0;
 
 impl Motion {
-    /// From where the joints are to the trajectory's end, or until something breaks it off: after so many seconds, for that reason.
+    /// The motion from the joints' positions to the trajectory's end, or until it breaks off after this many seconds for this reason.
     pub(crate) fn new(
         trajectory: Curve,
         start: JointVector,
@@ -70,7 +69,7 @@ impl Motion {
         let (mut at, mut moving) = (start, JointVector::zeros(start.len()));
         loop {
             let time_s = dt * (motion.course.len() - 1) as f64;
-            // What is on its way goes on while it brakes.
+            // After a motion breaks off, the joints continue while they brake.
             let broken = motion.breaks.as_ref().is_some_and(|(breaks_s, _)| *breaks_s <= time_s);
             let wanted = motion.trajectory.sample(time_s);
             let (radians, metres) = motion.off(&at, &wanted.positions);
@@ -103,13 +102,12 @@ impl Motion {
         }
     }
 
-    /// How long it takes, in seconds.
+    /// Duration of the motion, in seconds.
     pub(crate) fn lasts_s(&self) -> f64 {
         self.breaks.as_ref().map_or(self.course_s(), |(breaks_s, _)| *breaks_s)
     }
 
-    /// Where the joints are after so many seconds: a smooth curve through the course (Catmull and Rom). Beyond its end they go on as fast
-    /// as they were.
+    /// The joint positions after this many seconds: a smooth curve through the course (Catmull and Rom). Beyond its end they continue at their last velocity.
     pub(crate) fn at(&self, time_s: f64) -> JointVector {
         let steps = (time_s / STEP.as_secs_f64()).max(0.0);
         let (index, t) = (steps as usize, steps.fract());
@@ -122,12 +120,12 @@ impl Motion {
         })
     }
 
-    /// How long it is known where the joints are, in seconds: longer than the motion lasts where something breaks that off.
+    /// How long the joint positions are known, in seconds: longer than the motion lasts if it breaks off.
     pub(crate) fn course_s(&self) -> f64 {
         STEP.as_secs_f64() * (self.course.len() - 1) as f64
     }
 
-    /// How fast the joints are after so many seconds, and how fast that changes, per second and per second squared.
+    /// Joint velocities and accelerations after this many seconds, per second and per second squared.
     pub(crate) fn derivatives(&self, time_s: f64) -> (JointVector, JointVector) {
         let dt = STEP.as_secs_f64();
         let time_s = time_s.max(dt);
@@ -144,7 +142,7 @@ impl Motion {
         JointVector::from_fn(end.len(), |j| end[j] + (end[j] - before[j]) * beyond as f64)
     }
 
-    /// Where the joints end, at rest.
+    /// The positions of the joints at rest at the end.
     ///
     /// # Errors
     /// Why the motion breaks off: the joints still move then, and have to brake.
@@ -155,7 +153,7 @@ impl Motion {
         }
     }
 
-    /// How well it was followed for so many seconds.
+    /// The tracking errors of the first `time_s` seconds.
     pub(crate) fn tracking(&self, time_s: f64) -> Tracking {
         let dt = STEP.as_secs_f64();
         let turning: Vec<usize> = (0..self.course[0].len()).filter(|j| !self.slides[*j]).collect();
@@ -176,7 +174,7 @@ impl Motion {
         Tracking { rms_rad: root(tracking.rms_rad), rms_m: root(tracking.rms_m), ..tracking }
     }
 
-    /// How far the joints are from where they should be: the one that is turned too far at the most, and those that slide together.
+    /// Distance of the joints from their trajectory: the maximum of the revolute joints, and the Euclidean distance of the prismatic ones.
     fn off(&self, at: &JointVector, wanted: &JointVector) -> (f64, f64) {
         let off = |j: usize| (at[j] - wanted[j]).abs();
         let (sliding, turning): (Vec<usize>, Vec<usize>) = (0..at.len()).partition(|j| self.slides[*j]);
@@ -186,7 +184,7 @@ impl Motion {
 }
 
 impl Controller {
-    /// Which joints of a base slide: x and y.
+    /// Which joints of a base are prismatic: x and y.
     pub(crate) fn base_slides() -> PerJoint<bool> {
         PerJoint::from_fn(3, |j| j < 2)
     }
@@ -202,7 +200,7 @@ impl Controller {
 }
 
 impl Tracking {
-    /// The worse of both, figure by figure.
+    /// The larger value of both, for each field.
     pub fn or_worse(self, other: Tracking) -> Tracking {
         Tracking {
             most_rad: self.most_rad.max(other.most_rad),
@@ -223,7 +221,7 @@ mod tests {
         Controller { of: "base", stiffness: 20.0, most_off: 0.05, slides: Controller::base_slides() }
     }
 
-    /// Straight along x with an acceleration of 0.5 m/s² for two seconds, and down again.
+    /// Moves along x with an acceleration of 0.5 m/s² for two seconds, then decelerates as much.
     fn straight(robot: &Robot) -> Curve {
         let point = |time_s: f64, x: f64, v: f64| TrajectoryPoint {
             time_s,

@@ -1,20 +1,20 @@
-//! What the fingers of an arm have closed around last, and whether they have parted from it.
+//! What the fingers of an arm last closed around, and whether they have separated from it.
 //!
 //! ```text
-//! Nothing ──close──▶ Something ──let go──▶ Something, the arm stays ──each 3 mm away──▶ Something, the arm may leave
-//!    ▲   └─in vain──▶ Slipped ──open, or a motion sets out──▶ (as Nothing)
+//! Nothing ──close──▶ Something ──release──▶ Something, the arm stays ──each 3 mm away──▶ Something, the arm may leave
+//!    ▲   └─fails──▶ Slipped ──open fully, or start a motion──▶ (as Nothing)
 //!    └── closed around nothing at all
 //! ```
 
-/// How far each finger goes away from what it lets go before the arm may leave, in metres.
+/// How far each finger moves away from a released object before the arm may leave, in metres.
 const PARTED_M: f64 = 0.003;
-/// How far the fingers may be from where they should be and still count as there, in metres.
+/// Tolerance for finger positions, in metres.
 const ROUNDED_M: f64 = 1e-6;
 
-/// Where the fingers of an arm have closed last.
+/// The last closing of an arm's fingers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Closed {
-    /// How far each was from the middle, in metres. They have never been nearer to each other since.
+    /// Distance of each finger from the middle, in metres. They have never been closer to each other since.
     pub(super) at_m: f64,
     pub(super) around: Around,
 }
@@ -22,11 +22,11 @@ pub(super) struct Closed {
 /// What fingers have closed around.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Around {
-    /// Nothing that they could still be at.
+    /// Nothing that they could still touch.
     Nothing,
-    /// What they hold, or have let go.
+    /// An object that they hold, or have released.
     Something,
-    /// What they do not hold, because it slipped out of them or they were stopped on their way: they may be in it.
+    /// An object that they do not hold, because it slipped out or they were stopped while closing: they may overlap with it.
     Slipped,
 }
 
@@ -34,22 +34,22 @@ impl Closed {
     /// Fingers that have never closed.
     pub(super) const NEVER: Closed = Closed { at_m: 0.0, around: Around::Nothing };
 
-    /// How far each finger has to be from the middle to have parted, where `open_m` is the farthest: in metres.
+    /// Distance from the middle at which each finger has separated, in metres; `open_m` is the maximum.
     fn parted_m(self, open_m: f64) -> f64 {
         (self.at_m + PARTED_M).min(open_m) - ROUNDED_M
     }
 
-    /// Whether fingers that are `finger` metres from the middle have gone away from where they had closed.
+    /// Whether fingers that are `finger` metres from the middle have moved away from where they had closed.
     pub(super) fn has_parted(self, finger: f64, open_m: f64) -> bool {
         finger >= self.parted_m(open_m)
     }
 
-    /// Whether fingers that hold nothing may still be at what they have let go.
+    /// Whether fingers that hold nothing may still be at the object that they released.
     pub(super) fn is_at_what_it_let_go(self, finger: f64, open_m: f64) -> bool {
         self.around == Around::Something && !self.has_parted(finger, open_m)
     }
 
-    /// Whether fingers that hold nothing and do not close push what they meet.
+    /// Whether fingers that hold nothing and do not close push the objects that they touch.
     pub(super) fn pushes(self, finger: f64, open_m: f64) -> bool {
         match self.around {
             Around::Nothing => true,

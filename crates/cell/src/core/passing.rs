@@ -1,4 +1,4 @@
-//! Time that passes: the environment's steps, what is held, the battery.
+//! The passing of time: the environment's steps, the held objects, the battery.
 
 use super::activity::{Activity, Kind};
 use super::braking::Way;
@@ -8,8 +8,8 @@ use super::protocol::{Command, Ending, Module};
 use ratn_model::time::Timestamp;
 
 impl Cell {
-    /// Lets time go on to `time`, step by step where something moves. Stops at a step at which a held object is lost, because that ends motions,
-    /// and something else may be due before `time`; returns whether it did.
+    /// Advances the time to `time`, step by step where something moves. Stops at a step at which a held object is lost, because that ends motions,
+    /// and something else may be due before `time`; returns whether it stopped.
     pub(super) fn pass_until(&mut self, time: Timestamp, out: &mut Vec<Command>) -> bool {
         while self.environment.next_step() <= time {
             if self.environment.is_at_rest() && !self.may_move() {
@@ -68,7 +68,7 @@ impl Cell {
         is_lost
     }
 
-    /// Whether something may move that the environment does not know of: the robot, or what it holds.
+    /// Whether something may move that the environment does not simulate: the robot, or an object that it holds.
     pub(super) fn may_move(&self) -> bool {
         let moves = self.activities.keys().any(|module| *module != Module::Camera);
         let moves = (moves && !self.clock.stands(self.now)) || !self.braking.is_empty();

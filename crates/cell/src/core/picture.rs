@@ -1,4 +1,4 @@
-//! What the camera looks at: the true scene at one moment, robot included, and the frames taken of it.
+//! What the camera sees: the true scene at one moment, including the robot, and the frames taken of it.
 
 use super::environment::Model;
 use super::placement::furniture;
@@ -15,30 +15,30 @@ use ratn_world::scene::Shape;
 /// The true scene at one moment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scenery {
-    /// Where the robot truly is.
+    /// The true configuration of the robot.
     pub configuration: Configuration,
-    /// Where it believes to be.
+    /// The measured configuration of the robot.
     pub measured: Configuration,
-    /// The camera's true optical frame, in the world.
+    /// The true pose of the camera's optical frame, in the world.
     pub eye: Pose,
-    /// What the cell is furnished for.
+    /// The setting, which determines the furniture.
     pub setting: Setting,
-    /// Everything that can be moved, and where it is in the world frame.
+    /// All movable objects and their poses in the world frame.
     pub objects: Vec<(Model, Pose)>,
 }
 
-/// Frames of a scene that stood still.
+/// Frames of a scene that did not change.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Exposure {
-    /// What was there.
+    /// The scene.
     pub scenery: Scenery,
     /// The number of the first frame since the cell began.
     pub first_frame: u64,
-    /// How many frames were taken of it.
+    /// Number of frames.
     pub frames: u32,
 }
 
-/// Red, green and blue of things in a photograph.
+/// Red, green and blue of the bodies in a photograph.
 const ROBOT_COLOUR: [u8; 3] = [235, 140, 40];
 const TABLE_COLOUR: [u8; 3] = [170, 125, 85];
 const FLOOR_COLOUR: [u8; 3] = [140, 140, 145];
@@ -48,12 +48,12 @@ const OBJECT_COLOUR: [u8; 3] = [60, 120, 200];
 const FLOOR_SIZE: [f64; 3] = [12.0, 12.0, 0.1];
 
 impl Scenery {
-    /// Every body that the camera could see.
+    /// All bodies that the camera could see.
     pub fn bodies(&self, robot: &Robot) -> Vec<Body> {
         self.in_colours(robot).into_iter().map(|(body, _)| body).collect()
     }
 
-    /// What it looks like to people, from anywhere.
+    /// A colour picture for people, from any camera pose.
     pub fn photograph(&self, robot: &Robot, camera: &Camera) -> Picture {
         photograph(camera, &self.in_colours(robot))
     }
@@ -72,7 +72,8 @@ impl Scenery {
     }
 }
 
-/// The average of all frames, each from where the camera truly was; what passed before the rest is left out where the rest was seen. Takes milliseconds per exposure.
+/// The average of all frames, each from the true camera pose; a moving body is left out where what stands behind it was seen. Takes milliseconds per
+/// exposure.
 pub fn develop(robot: &Robot, camera: &Camera, noise: &Noise, seed: u64, exposures: &[Exposure]) -> DepthImage {
     let pictures = exposures.iter().map(|exposure| {
         let eye = Camera { pose: exposure.scenery.eye, ..*camera };

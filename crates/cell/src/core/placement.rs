@@ -1,5 +1,5 @@
-//! Lays a random scene in which the task can be done: objects stand apart from each other and within reach, and each can be grasped from above
-//! while all others still stand there. The same seed gives the same scene.
+//! Lays a random scene in which the task is feasible: objects stand apart from each other and within reach, and each can be grasped from above while
+//! all others are still there. The same seed gives the same scene.
 
 use super::demands::{self, Unmet};
 use super::environment::{Furniture, Kind, Model};
@@ -24,70 +24,70 @@ use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::FRAC_PI_2;
 use std::ops::Range;
 
-/// No scene was laid.
+/// Why no scene was laid.
 #[derive(Debug, thiserror::Error)]
 pub enum PlacementError {
-    /// No scene was found in which the task could be done.
+    /// No scene was found in which the task is feasible.
     #[error(
         "no feasible scene with {count} objects was found from seed {seed} in {MAX_TABLES} tries; try another seed"
     )]
     Crowded {
-        /// How many objects.
+        /// Number of objects.
         count: usize,
-        /// From which seed.
+        /// The seed.
         seed: u64,
     },
-    /// There are fewer places to bring boxes to.
+    /// There are not enough places for delivered boxes.
     #[error(
         "{count} boxes: the [workplace] of `{robot}` has places for {places}: say so many (`--boxes`, or `boxes` in [cell] of the config), or \
          give the workplace more"
     )]
     Places {
-        /// How many boxes.
+        /// Number of boxes.
         count: usize,
-        /// For how many there are places.
+        /// Number of places.
         places: usize,
-        /// Which robot.
+        /// The robot.
         robot: String,
     },
-    /// The robot's description.
+    /// The robot's description is invalid.
     #[error(transparent)]
     Robot(#[from] DescriptionError),
-    /// The gripper cannot open as far as the config says, or would not open around every box.
+    /// The gripper cannot open as far as the config says, or not wide enough for every box.
     #[error("`gripper.opening_m` of the cell is {opening_m}: {reason}")]
     Opening {
-        /// What the config says, in metres.
+        /// The opening in the config, in metres.
         opening_m: f64,
-        /// What it must be.
+        /// The rule that it violates.
         reason: String,
     },
-    /// A robot that cannot do what a cell is for.
+    /// The robot does not meet the requirements of a cell.
     #[error("the robot `{robot}` cannot stand in a cell: {}", unmet.iter().map(Unmet::to_string).collect::<Vec<_>>().join("; and "))]
     Unfit {
-        /// Which robot.
+        /// The robot.
         robot: String,
-        /// All that it lacks, and what next.
+        /// The requirements that it does not meet, and what to do about each.
         unmet: Vec<Unmet>,
     },
 }
 
-/// Tables tried.
+/// Number of tables that are tried.
 const MAX_TABLES: usize = 3000;
-/// Places tried for one box.
+/// Number of places that are tried for one box.
 const MAX_PLACES: usize = 60;
-/// Free space between two boxes, in metres: what the detector needs to tell them apart.
+/// Minimum distance between two boxes, in metres: the detector needs it to separate them.
 const GAP_M: f64 = 0.045;
-/// Room that the fingers need at a box for what the detector gets wrong, in metres: across it beyond half of their opening and their
-/// thickness, and along it beyond half of their width.
+/// Room for the fingers at a box because of detection errors, in metres: across the box in addition to half their opening and their thickness, along
+/// it in addition to half their width.
 const FINGER_ROOM_M: f64 = 0.02;
 const FINGER_ROOM_ALONG_M: f64 = 0.0205;
 /// The table's name.
 pub const TABLE: &str = "table";
 
-/// What can be moved of a new scene.
+/// The movable objects of a new scene.
 ///
 /// # Errors
-/// [`PlacementError`] when there seems to be no feasible one.
+/// [`PlacementError`] if no feasible scene was found.
 pub fn objects(robot: &Robot, setting: Setting, goods: Goods, seed: u64) -> Result<Vec<Placed>, PlacementError> {
     match setting {
         Setting::Boxes => boxes(robot, goods.boxes, seed),
@@ -104,21 +104,21 @@ fn dishes(robot: &Robot, goods: Goods, seed: u64) -> Result<Vec<Placed>, Placeme
     feasible.ok_or(PlacementError::Crowded { count: goods.count(Setting::Table), seed })
 }
 
-/// Boxes on the table: so many for each arm that has a share of the workplace, the first arm's first.
+/// Boxes on the table: `count` for each arm that has a share of the workplace, the first arm's first.
 fn boxes(robot: &Robot, count: usize, seed: u64) -> Result<Vec<Placed>, PlacementError> {
     let workplace = workplace(robot);
     let places = workplace.shares().map(|(_, places)| places.at.len()).min().unwrap_or(0);
     if count > places {
         return Err(PlacementError::Places { count, places, robot: robot.name().to_owned() });
     }
-    // A share is of an arm that the robot has: the description was checked.
+    // Every share names an arm of the robot: the description was checked.
     let others = workplace.others.iter().filter_map(|share| robot.with_arm(&share.arm).ok());
     let views: Vec<Robot> = std::iter::once(robot.clone()).chain(others).collect();
     let grounds = workplace.shares().zip(&views).map(|((boxes, _), view)| Ground::of(view, boxes));
     let shares: Vec<(&Robot, Ground)> = views.iter().zip(grounds).collect();
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     for table in 0..MAX_TABLES {
-        // Long boxes get rarer as the table gets fuller, and the more tries have failed.
+        // The fuller the table and the more tries have failed, the rarer are long boxes.
         let crowding = (count as f64 / 9.0).powi(2) * 0.6 + 0.4 * table as f64 / MAX_TABLES as f64;
         let mut footprints = Vec::with_capacity(count * shares.len());
         if !shares.iter().all(|(_, ground)| add(&mut footprints, &mut random, ground, count, crowding.min(1.0))) {
@@ -134,10 +134,10 @@ fn boxes(robot: &Robot, count: usize, seed: u64) -> Result<Vec<Placed>, Placemen
     Err(PlacementError::Crowded { count: count * shares.len(), seed })
 }
 
-/// Where the robot of a cell fetches boxes.
+/// The workplace of a cell's robot.
 ///
 /// # Panics
-/// A robot without a workplace: [`fit`] refuses it before a cell is made.
+/// If the robot has no workplace: [`fit`] refuses it before a cell is created.
 pub fn workplace(robot: &Robot) -> &Workplace {
     match robot.workplace() {
         Some(workplace) => workplace,
@@ -148,7 +148,7 @@ pub fn workplace(robot: &Robot) -> &Workplace {
 /// The pads of a robot that can stand in a cell of this config.
 ///
 /// # Errors
-/// [`PlacementError::Unfit`] says what it lacks, [`PlacementError::Opening`] how its gripper opens.
+/// [`PlacementError::Unfit`] lists the unmet requirements, [`PlacementError::Opening`] says what is wrong with the opening.
 pub fn fit(robot: &Robot, config: &CellConfig) -> Result<Pads, PlacementError> {
     let unmet = demands::unmet(robot, config.scene);
     match Pads::of(robot).filter(|_| unmet.is_empty()) {
@@ -157,7 +157,7 @@ pub fn fit(robot: &Robot, config: &CellConfig) -> Result<Pads, PlacementError> {
     }
 }
 
-/// Checks that the gripper can open as far as the config says, and that every box fits in between then.
+/// Checks that the gripper can open as far as the config says, and that every box then fits between the fingers.
 fn check_opening(robot: &Robot, config: &CellConfig) -> Result<(), PlacementError> {
     let Some(opening_m) = config.gripper.opening_m else { return Ok(()) };
     let (most, name, widest) = (2.0 * robot.open_finger_m(), robot.name(), widest(workplace(robot)));
@@ -173,12 +173,12 @@ fn check_opening(robot: &Robot, config: &CellConfig) -> Result<(), PlacementErro
     Err(PlacementError::Opening { opening_m, reason })
 }
 
-/// How wide the widest box across the fingers is.
+/// Width of the widest box across the fingers.
 fn widest(workplace: &Workplace) -> f64 {
     workplace.shares().map(|(boxes, _)| boxes.greatest[1]).fold(0.0, f64::max)
 }
 
-/// What never moves, as objects of the scene.
+/// The furniture, as objects of the scene.
 pub fn fixed(robot: &Robot, setting: Setting) -> impl Iterator<Item = SceneObject> {
     let parts = |piece: Furniture| {
         let name = piece.name;
@@ -191,7 +191,7 @@ pub fn fixed(robot: &Robot, setting: Setting) -> impl Iterator<Item = SceneObjec
     furniture(robot, setting).into_iter().flat_map(parts)
 }
 
-/// What never moves.
+/// The furniture: everything that never moves.
 pub fn furniture(robot: &Robot, setting: Setting) -> Vec<Furniture> {
     let Slab { centre: [x, y, z], size } = workplace(robot).table;
     let table = Furniture { name: TABLE.to_owned(), parts: vec![(Pose::at(x, y, z), size)] };
@@ -216,17 +216,17 @@ struct Rectangle {
     half: [f64; 2],
 }
 
-/// Where boxes are put, and with what room.
+/// The area for boxes, and the room that fingers need there.
 #[derive(Debug, Clone, Copy)]
 struct Ground {
     boxes: Boxes,
-    /// What the fingers need across a box, from its middle.
+    /// Room for the fingers across a box, from its middle.
     finger_reach_m: f64,
-    /// What they need along it, from its middle.
+    /// Room for the fingers along a box, from its middle.
     finger_half_width_m: f64,
 }
 
-/// Adds so many to those that are there, all of them clear of each other; whether there was room.
+/// Adds `count` boxes to the placed ones, all of them apart from each other; returns whether there was room.
 fn add(placed: &mut Vec<Footprint>, random: &mut ChaCha8Rng, ground: &Ground, count: usize, crowding: f64) -> bool {
     let Boxes { x, y, least, greatest } = ground.boxes;
     for _ in 0..count {
@@ -251,7 +251,7 @@ fn add(placed: &mut Vec<Footprint>, random: &mut ChaCha8Rng, ground: &Ground, co
 }
 
 impl Ground {
-    /// Where the boxes of an arm are put, from which the robot is seen.
+    /// The area for the boxes of the arm from which `view` sees the robot.
     fn of(view: &Robot, boxes: &Boxes) -> Ground {
         let (thick, half_width) = Pads::of(view).map_or((0.0, 0.0), |pads| (pads.thick, (pads.x[1] - pads.x[0]) / 2.0));
         Ground {
@@ -299,12 +299,12 @@ impl Rectangle {
     }
 }
 
-/// Whether each object that can be taken from above at all can be so while all of them stand there.
+/// Whether each object that can be grasped from above at all can be grasped while all of them are there.
 fn all_graspable(robot: &Robot, setting: Setting, placed: &[Placed]) -> bool {
     graspable(robot, robot, setting, placed, 0..placed.len())
 }
 
-/// The same of some of the objects, with the arm from which `view` sees the robot.
+/// The same for some of the objects, with the arm from which `view` sees the robot.
 fn graspable(robot: &Robot, view: &Robot, setting: Setting, placed: &[Placed], which: Range<usize>) -> bool {
     let parts = placed.iter().flat_map(|object| {
         object.model.parts().into_iter().map(|(part, shape)| SceneObject {
@@ -328,12 +328,12 @@ fn graspable(robot: &Robot, view: &Robot, setting: Setting, placed: &[Placed], w
     })
 }
 
-/// The posture that a robot begins in.
+/// The initial posture of a robot.
 pub fn home(robot: &Robot) -> JointVector {
     robot.posture(HOME).unwrap_or_else(|| robot.at_zero().arm)
 }
 
-/// The ways to take an object from above.
+/// The grasps of an object from above.
 fn grasps(object: &Placed) -> Vec<Pose> {
     match object.model.kind {
         Kind::Bowl | Kind::Plate => grasp::at_rim(&object.pose, object.model.size),

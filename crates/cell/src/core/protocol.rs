@@ -1,4 +1,4 @@
-//! Events that go into the cell's core, and commands that come out of it.
+//! The events that the cell's core handles, and the commands that it returns.
 
 pub use super::activity::{Module, Ticket};
 use super::arms::FIRST;
@@ -15,47 +15,47 @@ use ratn_perception::camera::Camera;
 use ratn_worker::safety::SafetyState;
 use serde::{Deserialize, Serialize};
 
-/// What happens to the cell.
+/// An input of the cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Event {
     /// A goal for a module.
     Start {
-        /// The goal's id, by which commands name it.
+        /// The goal's id, which commands refer to.
         ticket: Ticket,
-        /// The number of the arm that does it, or whose gripper; 0 unless said. A request for another module does not look at it.
+        /// The number of the arm, or of the gripper's arm; 0 by default. Requests for other modules ignore it.
         #[serde(default, skip_serializing_if = "is_first")]
         arm: usize,
         /// What to do.
         request: Request,
     },
-    /// A goal is to stop: its giver wants that or is gone, or its lease has ended.
+    /// Stops a goal: its client wants that or is gone, or its lease has ended.
     Stop {
         /// The goal.
         ticket: Ticket,
-        /// Why it is to stop.
+        /// The reason.
         reason: String,
     },
-    /// An emergency stop or a hold is in force from now on, or neither is any more.
+    /// An emergency stop or a hold begins, or the last one ends.
     Safety {
-        /// What is in force now.
+        /// The state from now on.
         state: SafetyState,
     },
-    /// A new table; the robot goes back to its first posture.
+    /// A new scene; the robot returns to its first posture.
     Reset {
-        /// The seed that sizes and places of the objects are derived from.
+        /// The seed for the sizes and poses of the objects.
         seed: u64,
-        /// The objects on it.
+        /// The objects in it.
         goods: Goods,
     },
     /// A fault is injected.
     Fault {
-        /// What goes wrong, and when.
+        /// What fails, and when.
         fault: Fault,
     },
-    /// Asks for the whole state (a snapshot).
+    /// Asks for the complete state (a snapshot).
     Save,
-    /// Back to a state; goals under way end aborted.
+    /// Restores a state; current goals end `aborted`.
     PutBack {
         /// The state.
         snapshot: Box<Snapshot>,
@@ -64,159 +64,159 @@ pub enum Event {
     Tick,
 }
 
-/// What a module can do.
+/// What a module can be asked to do.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Request {
     /// Moves the base along a trajectory.
     Drive {
-        /// Points in x, y (metres) and heading (radians), beginning where the base is.
+        /// Points in x, y (metres) and heading (radians), beginning at the base's pose.
         trajectory: Trajectory,
     },
     /// Moves an arm along a trajectory.
     Follow {
-        /// Beginning where the arm is; positions in radians.
+        /// Points in joint positions, in radians, beginning at the arm's posture.
         trajectory: Trajectory,
     },
-    /// Moves the arm to a posture, in a straight line of joint positions.
+    /// Moves the arm to a posture, in a straight line in joint space.
     MoveTo {
-        /// The posture that the arm ends in.
+        /// The goal posture.
         joints: JointVector,
-        /// The fraction of its greatest speed, above 0 and at most 1.
+        /// The fraction of the maximum speed, above 0 and at most 1.
         speed: f64,
     },
     /// Closes the fingers around something.
     Grasp {
-        /// The name that the goal's giver has for the object; it comes back in [`Product::Grasped`].
+        /// The client's name for the object; it is returned in [`Product::Grasped`].
         object: String,
-        /// The pose in the tool frame that the object is expected to have then.
+        /// The expected pose of the object in the tool frame.
         expected: Option<Pose>,
     },
     /// Opens the fingers.
     Release,
-    /// Opens the fingers so far and no further.
+    /// Opens the fingers to a given width.
     OpenTo {
-        /// How far they are apart then, in metres.
+        /// The distance between them, in metres.
         width: f64,
     },
     /// Turns the camera.
     LookAt {
-        /// Towards this point of the world.
+        /// The point in the world at which the camera shall look.
         target: [f64; 3],
     },
-    /// Asks where the base stands.
+    /// Asks for the pose of the base.
     SenseBase,
-    /// Asks where the arm's joints are.
+    /// Asks for the arm's joint positions.
     SenseArm,
-    /// Asks how far the fingers are open, and whether they hold something.
+    /// Asks how far the fingers are open, and whether they hold an object.
     SenseGripper,
     /// Takes a picture.
     Capture {
-        /// How many frames are averaged.
+        /// Number of frames to average.
         frames: u32,
     },
 }
 
-/// A command of the core to the process around it.
+/// An output of the core, for the process around it.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Command {
     /// A goal has ended.
     Ended {
         /// The goal.
         ticket: Ticket,
-        /// How it has ended.
+        /// Its result.
         ending: Ending,
-        /// How well it followed a trajectory, to its end or as far as it came.
+        /// The tracking errors of its trajectory, as far as it was followed.
         tracking: Option<Tracking>,
     },
-    /// The state that [`Event::Save`] asked for.
+    /// The reply to [`Event::Save`].
     Saved {
-        /// The whole state.
+        /// The complete state.
         snapshot: Box<Snapshot>,
     },
-    /// Two bodies touched that should not have.
+    /// An unintended contact of two bodies.
     Touched {
-        /// The two bodies, how deep they were in each other, and how they moved.
+        /// The two bodies, the depth of their overlap, and their speed.
         contact: Contact,
     },
-    /// What only the cell knows: why the fingers hold nothing, what somebody has moved. For the cell's log, not for the task.
+    /// A fact that only the cell knows, such as why the fingers hold nothing, or which object was moved. For the cell's log, not for the task.
     Noted {
         /// A sentence without a full stop.
         what: String,
     },
 }
 
-/// How a goal ends.
+/// The end of a goal.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Ending {
-    /// It was done.
+    /// The goal succeeded.
     Done(Product),
-    /// It was not done, or not to its end. The module holds.
+    /// The goal failed. The module holds its position.
     Aborted(String),
-    /// It was stopped. The module holds.
+    /// The goal was stopped. The module holds its position.
     Preempted(String),
-    /// An emergency stop ended it, before or after it began. The module holds.
+    /// An emergency stop ended the goal, before or after it began. The module holds its position.
     Stopped(String),
 }
 
-/// What comes of a goal.
+/// The result of a successful goal.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Product {
-    /// The base has come to the end of its trajectory.
+    /// The base has reached the end of its trajectory.
     Driven {
-        /// Where it believes to stand, in the world frame.
+        /// Its localised pose, in the world frame.
         end: Pose,
-        /// How well it followed.
+        /// The tracking errors.
         tracking: Tracking,
     },
-    /// The arm has come to the end of its trajectory.
+    /// The arm has reached the end of its trajectory.
     Moved {
         /// Its posture.
         end: JointVector,
-        /// How well it followed.
+        /// The tracking errors.
         tracking: Tracking,
     },
-    /// Something is in the gripper.
+    /// The gripper holds an object.
     Grasped {
         /// The name that the goal gave the object.
         object: String,
         /// The opening of the fingers around it, in metres.
         width: f64,
-        /// Where it is in the tool frame, by what was expected and what two fingers feel of it ([`super::grasping::felt`]). `None` when
-        /// nothing was expected: fingers feel a width and no more.
+        /// The pose in the tool frame, from the expected pose and what two fingers measure ([`super::grasping::felt`]). `None` without an expected
+        /// pose: fingers measure only a width.
         in_gripper: Option<Pose>,
     },
     /// The fingers are open.
     Released,
-    /// Where the base believes to stand.
+    /// The localised pose of the base.
     BaseSensed {
-        /// Its frame, in the world frame.
+        /// The pose of its frame, in the world frame.
         pose: Pose,
     },
-    /// Where the arm is.
+    /// The posture of the arm.
     ArmSensed {
-        /// Its posture.
+        /// Its joint positions.
         joints: JointVector,
     },
-    /// How the fingers are.
+    /// The state of the gripper.
     GripperSensed {
-        /// Their opening, in metres.
+        /// The opening, in metres.
         width: f64,
-        /// Whether they are closed around something.
+        /// Whether the fingers are closed around an object.
         holding: bool,
     },
-    /// The camera looks at the point that was asked for.
+    /// The camera looks at the requested point.
     Looking {
         /// Pan, in radians.
         pan: f64,
         /// Tilt, in radians.
         tilt: f64,
     },
-    /// A picture to be developed.
+    /// A picture to be rendered.
     Captured {
-        /// The camera as the robot has it, by its own kinematics.
+        /// The camera with the pose that the robot computes by its own kinematics.
         camera: Camera,
-        /// What was there, frame by frame.
+        /// The scenes of its frames.
         exposures: Vec<Exposure>,
     },
 }
@@ -226,7 +226,7 @@ fn is_first(arm: &usize) -> bool {
 }
 
 impl Request {
-    /// The module that does it, where it is meant for the arm of this number.
+    /// The module that performs the request, if it is for the arm of this number.
     pub fn module(&self, arm: usize) -> Module {
         match self {
             Request::Drive { .. } | Request::SenseBase => Module::Base,

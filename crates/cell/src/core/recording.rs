@@ -1,14 +1,14 @@
-//! The recording of a cell, line by line, and its replay: the same cell is made again and given the same events.
+//! The recording of a cell, line by line, and its replay: a new cell of the same config gets the same events.
 //!
 //! ```text
-//! {"form":2,"config":{…},"robot":{…}}                      first: how the cell was made, and of which robot
-//! {"at":…,"event":{…}}                                     what came in, in the robot's nanoseconds
-//! {"at":…,"ended":…,"how":"done"}                          what a goal came to
-//! {"at":…,"contact":{…}}                                    what touched that should not have
+//! {"form":2,"config":{…},"robot":{…}}                      first: the cell's config and its robot
+//! {"at":…,"event":{…}}                                     an event, at a time of the robot in nanoseconds
+//! {"at":…,"ended":…,"how":"done"}                          the result of a goal
+//! {"at":…,"contact":{…}}                                   an unintended contact
 //! {"at":…,"world":"…"}                                     after each event: the digest of the environment
 //! ```
-//! The core is a function of its events, so a recording is replayed by giving them again; the endings and the digests say whether the
-//! same came of it. Ticks are left out: nothing depends on when the core is asked.
+//! The core is a function of its events, so a recording is replayed by sending them again; the results and the digests show whether the replay is the
+//! same. Ticks are left out: nothing depends on when they come.
 
 use super::cell::Cell;
 use super::contacts::Contact;
@@ -21,28 +21,28 @@ use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 use std::io;
 
-/// The form of what is written.
+/// The format version of recordings.
 const FORM: u32 = 2;
 
-/// One line.
+/// A line of a recording.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Line {
-    /// The first.
+    /// The first line.
     Header {
-        /// The form of the lines; another one is refused.
+        /// The format version; any other is refused.
         form: u32,
-        /// How the cell was made.
+        /// The config of the cell.
         config: Box<CellConfig>,
-        /// Of which robot; a recording of an earlier version does not say.
+        /// The robot of the cell; missing in recordings of earlier versions.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         robot: Option<RobotIdentity>,
     },
-    /// Something came in.
+    /// An event.
     Event {
-        /// When it came in.
+        /// When it happened.
         at: Timestamp,
-        /// What came in.
+        /// The event.
         event: Event,
     },
     /// A goal ended.
@@ -53,49 +53,49 @@ pub enum Line {
         ended: Ticket,
         /// `done`, `aborted`, `preempted` or `stopped`.
         how: String,
-        /// Why, where it was not done.
+        /// The reason, unless it succeeded.
         #[serde(default, skip_serializing_if = "String::is_empty")]
         reason: String,
-        /// How well it followed its trajectory, where it followed one.
+        /// The tracking errors, if it followed a trajectory.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         tracking: Option<Tracking>,
     },
-    /// Two bodies touched that should not have.
+    /// An unintended contact of two bodies.
     Contact {
-        /// When it was told.
+        /// When it was reported.
         at: Timestamp,
-        /// The two bodies, how deep they were in each other, and how they moved.
+        /// The two bodies, the depth of their overlap, and their speed.
         contact: Contact,
     },
     /// The environment after an event.
     World {
-        /// When.
+        /// When the event happened.
         at: Timestamp,
         /// The digest of the environment.
         world: String,
     },
 }
 
-/// The result of a replay in which everything happened as recorded.
+/// The result of a replay that is equal to the recording.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Replayed {
-    /// How many events came in.
+    /// Number of events.
     pub events: usize,
-    /// How many goals ended, each as recorded.
+    /// Number of goals, each of which ended as recorded.
     pub goals: usize,
-    /// When the last event was, in the robot's seconds.
+    /// When the last event happened, in the robot's seconds.
     pub end_s: f64,
-    /// How well trajectories were followed: the worst of all.
+    /// The maximum tracking errors of all trajectories.
     pub tracking: Tracking,
 }
 
-/// Why a recording is not replayed, or where the replay differs from it.
+/// Why a recording cannot be replayed, or where the replay differs from it.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
     /// A line cannot be read.
     #[error("line {line} cannot be read")]
     Unreadable {
-        /// Which, from 1.
+        /// The line number, from 1.
         line: usize,
         /// Why.
         #[source]
@@ -104,32 +104,32 @@ pub enum ReplayError {
     /// A line is not a line of a recording.
     #[error("line {line} is none of a recording: {reason}")]
     NoRecording {
-        /// Which, from 1.
+        /// The line number, from 1.
         line: usize,
         /// Why.
         reason: String,
     },
-    /// The cell cannot be made.
+    /// The cell cannot be created.
     #[error(transparent)]
     Table(#[from] PlacementError),
-    /// The robot's description is another one now.
+    /// The robot's description has changed.
     #[error(
         "this recording is of the robot {of}, and the robot that its config names is {here} now: replay it with the description of then"
     )]
     AnotherRobot {
-        /// The recording's.
+        /// The robot of the recording.
         of: RobotIdentity,
-        /// The one that the config names.
+        /// The robot that the config names now.
         here: RobotIdentity,
     },
     /// The replay differs from what was recorded.
     #[error("line {line}: recorded was {recorded}, and now it is {replayed}")]
     Differs {
-        /// Which, from 1.
+        /// The line number, from 1.
         line: usize,
-        /// What the recording says.
+        /// The recorded value.
         recorded: String,
-        /// What the replay came to.
+        /// The value in the replay.
         replayed: String,
     },
 }
@@ -141,7 +141,7 @@ impl Line {
         Line::Header { form: FORM, config, robot }
     }
 
-    /// What is recorded of a step of the cell: its event, what ended, and the world after it.
+    /// The lines for a step of the cell: its event, the ended goals, and the world after it.
     pub fn of_step(at: Timestamp, event: Event, commands: &[Command], cell: &Cell) -> Vec<Line> {
         let is_tick = event == Event::Tick;
         let begin = (!is_tick).then_some(Line::Event { at, event });
@@ -163,10 +163,10 @@ impl Line {
     }
 }
 
-/// Goes through a recording again.
+/// Replays a recording.
 ///
 /// # Errors
-/// [`ReplayError`] where it is none, and at the first line that something else comes of.
+/// [`ReplayError`] if it is not a recording, and at the first line that differs.
 pub fn replay(lines: impl Iterator<Item = io::Result<String>>) -> Result<Replayed, ReplayError> {
     let mut cell: Option<Cell> = None;
     let mut endings: VecDeque<(Ticket, String)> = VecDeque::new();
@@ -217,7 +217,7 @@ pub fn replay(lines: impl Iterator<Item = io::Result<String>>) -> Result<Replaye
                 }
                 replayed.goals += 1;
             }
-            // What is made of the same world by the same rules is the same.
+            // Contacts follow from the world, which is compared.
             Line::Contact { .. } => {}
             Line::World { world, .. } => {
                 let now = cell.environment.digest().to_string();

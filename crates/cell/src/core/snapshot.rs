@@ -1,7 +1,7 @@
-//! A snapshot: the cell's state as a value, to which the same or another process can put its cell back.
+//! A snapshot: the cell's state as a value, which the same or another process can restore.
 //!
-//! Goals are not part of it, because their givers are gone when it is restored: every joint is where it had come to, and holds. Nor are the
-//! emergency stop, which concerns the real surroundings, and the contacts, which are counted anew.
+//! Goals are not part of it, because their clients are gone when it is restored: every joint keeps the position that it had, and holds. The emergency
+//! stop, which concerns the real surroundings, and the contacts, which are counted anew, are not part of it either.
 
 use super::arms::FIRST;
 use super::battery::Battery;
@@ -21,7 +21,7 @@ use ratn_motion::robot::{ArmPosition, Configuration, Robot, RobotIdentity};
 use serde::{Deserialize, Serialize};
 use std::ops::RangeInclusive;
 
-/// The form of what is written; another one is refused.
+/// The format version of snapshots; any other is refused.
 pub const FORM: u32 = 1;
 
 /// A cell's state.
@@ -30,24 +30,24 @@ pub const FORM: u32 = 1;
 pub struct Snapshot {
     /// [`FORM`].
     form: u32,
-    /// Of which robot; a snapshot of an earlier version does not say.
+    /// The robot; missing in snapshots of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     robot: Option<RobotIdentity>,
     seed: u64,
     ids: Vec<String>,
     tilts: Vec<f64>,
     environment: Saved,
-    /// As measured.
+    /// The measured posture.
     posture: Posture,
     held: Option<SavedHold>,
     battery: f64,
     frames_taken: u64,
     faults: Vec<Fault>,
-    /// Words drawn for faults by chance so far.
+    /// Words drawn from the generator of random faults so far.
     drawn: u64,
     blind_until: Timestamp,
     lost_until: Timestamp,
-    /// How often the base had come to a stop.
+    /// Number of stops of the base.
     #[serde(default)]
     stops: u64,
 }
@@ -59,10 +59,10 @@ struct Posture {
     pan: f64,
     tilt: f64,
     finger: f64,
-    /// Where the fingers last had closed; a snapshot of an earlier version does not say.
+    /// Position of the fingers after they last closed; missing in snapshots of earlier versions.
     #[serde(default)]
     closed_finger: f64,
-    /// They are still at what they have let go.
+    /// They are still at the object that they released.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     at_let_go: bool,
     /// The arms from number 1 on.
@@ -70,7 +70,7 @@ struct Posture {
     other_arms: Vec<ArmPosture>,
 }
 
-/// An arm beside the first one.
+/// An arm other than the first one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct ArmPosture {
     joints: JointVector,
@@ -90,62 +90,62 @@ struct SavedHold {
     friction: f64,
 }
 
-/// A snapshot that is none of this cell.
+/// Why a snapshot does not fit this cell.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SnapshotError {
-    /// No JSON, or another.
+    /// The text is not JSON, or not that of a snapshot.
     #[error("this is no snapshot of a cell: {0}")]
     Unreadable(String),
-    /// Of another version.
+    /// The snapshot has another format version.
     #[error("this snapshot has form {0}, this cell knows {FORM}")]
     OtherForm(u32),
-    /// Of a robot with another number of joints.
+    /// The snapshot is of a robot with another number of joints.
     #[error(
         "this snapshot is of a robot whose arm has {of} joints: the arm of this cell has {here}, so it cannot be put back to it"
     )]
     OtherRobot {
-        /// Of the snapshot's.
+        /// Number of joints in the snapshot.
         of: usize,
-        /// Of the cell's.
+        /// Number of joints in the cell.
         here: usize,
     },
-    /// Of another robot, as it says itself.
+    /// The snapshot names another robot.
     #[error(
         "this snapshot is of the robot {of}, and this cell has the robot {here}: put it back to a cell of its own robot"
     )]
     AnotherRobot {
-        /// The snapshot's.
+        /// The robot of the snapshot.
         of: RobotIdentity,
-        /// The cell's.
+        /// The robot of the cell.
         here: RobotIdentity,
     },
-    /// Parts that do not fit each other.
+    /// Parts of the snapshot contradict each other.
     #[error("this snapshot contradicts itself: {0}")]
     Inconsistent(&'static str),
 }
 
-/// The extents of what a cell has.
+/// Allowed sizes of objects.
 const SIZES_M: RangeInclusive<f64> = 1e-4..=10.0;
-/// No place, angle or speed of a cell is beyond that.
+/// Maximum absolute value of any position, angle or speed.
 const LARGEST: f64 = 1e6;
 
-/// Whether it is one: not farther than anything is, and turned by a rotation.
+/// Whether a pose is valid: its position is within bounds, and its quaternion is a rotation.
 fn is_pose(pose: &Pose) -> bool {
     let length = pose.quaternion_xyzw.iter().map(|x| x * x).sum::<f64>().sqrt();
     pose.position.iter().all(|x| x.abs() <= LARGEST) && (length - 1.0).abs() < 1e-6
 }
 
 impl Snapshot {
-    /// As text.
+    /// The snapshot as JSON.
     pub fn to_json(&self) -> String {
-        // Numbers, texts and lists: nothing that JSON cannot hold.
+        // Numbers, texts and lists: JSON can represent all of them.
         serde_json::to_string(self).unwrap_or_default()
     }
 
-    /// From text.
+    /// Reads a snapshot from JSON.
     ///
     /// # Errors
-    /// [`SnapshotError`] where it is none that a cell can be restored from.
+    /// [`SnapshotError`] if no cell can be restored from it.
     pub fn from_json(text: &str) -> Result<Snapshot, SnapshotError> {
         let snapshot: Snapshot =
             serde_json::from_str(text).map_err(|error| SnapshotError::Unreadable(error.to_string()))?;
@@ -169,7 +169,7 @@ impl Snapshot {
         snapshot.check_numbers().map(|()| snapshot)
     }
 
-    /// Whether physics can go on from its numbers.
+    /// Checks that the physics can continue with its numbers.
     fn check_numbers(&self) -> Result<(), SnapshotError> {
         let wrong = |what| Err(SnapshotError::Inconsistent(what));
         if self.environment.objects.iter().any(|(model, _)| !model.size.iter().all(|size| SIZES_M.contains(size))) {
@@ -193,10 +193,10 @@ impl Snapshot {
         }
     }
 
-    /// Whether a cell with this robot can be put back to it. A snapshot that does not say of which robot it is needs as many joints.
+    /// Checks that a cell with this robot can restore the snapshot. If the snapshot names no robot, the numbers of joints have to be equal.
     ///
     /// # Errors
-    /// [`SnapshotError::AnotherRobot`] and [`SnapshotError::OtherRobot`].
+    /// [`SnapshotError::AnotherRobot`], [`SnapshotError::OtherRobot`] or [`SnapshotError::Inconsistent`].
     pub fn check_robot(&self, here: &Robot) -> Result<(), SnapshotError> {
         if let Some(of) = self.robot.as_ref() {
             let here = here.identity();
@@ -215,20 +215,20 @@ impl Snapshot {
         Ok(())
     }
 
-    /// What each arm holds, in the order of their numbers.
+    /// The held object of each arm, in the order of the arm numbers.
     fn all_held(&self) -> impl Iterator<Item = Option<&SavedHold>> {
         let others = self.posture.other_arms.iter().map(|arm| arm.held.as_ref());
         std::iter::once(self.held.as_ref()).chain(others)
     }
 
-    /// Where the fingers of each arm are said to have closed, and whether they are at what they have let go.
+    /// The stored closing position of each arm's fingers, and whether they are at the object that they released.
     fn all_closed(&self) -> impl Iterator<Item = (f64, bool)> {
         let others = self.posture.other_arms.iter().map(|arm| (arm.closed_finger, arm.at_let_go));
         std::iter::once((self.posture.closed_finger, self.posture.at_let_go)).chain(others)
     }
 }
 
-/// Where fingers have closed that are `finger` metres from the middle: where they hold something, and never farther than they are.
+/// The last closing of fingers that are `finger` metres from the middle: their position if they hold an object, and never wider than they are now.
 fn closed_as((said_m, at_let_go): (f64, bool), finger: f64, holds: bool, open_m: f64) -> Closed {
     if holds {
         return Closed { at_m: finger, around: Around::Something };
@@ -237,14 +237,13 @@ fn closed_as((said_m, at_let_go): (f64, bool), finger: f64, holds: bool, open_m:
     match (at_let_go, closed.has_parted(finger, open_m)) {
         (true, _) => closed,
         (false, true) => Closed { around: Around::Nothing, ..closed },
-        // What they closed around in vain is not in a snapshot.
+        // The object that they failed to grasp is not in a snapshot.
         (false, false) => Closed { around: Around::Slipped, ..closed },
     }
 }
 
 impl Cell {
-    /// The state now. The battery counts its time anew from here on, as it does in a cell that is put back to the snapshot: so both cells behave
-    /// alike afterwards.
+    /// The current state. The battery restarts its times here, as it does in a cell that restores the snapshot: so both cells behave alike afterwards.
     pub(super) fn save(&mut self) -> Snapshot {
         let measured = self.measured();
         let Configuration { base, arm, pan, tilt, finger, .. } = measured;
@@ -285,7 +284,7 @@ impl Cell {
         }
     }
 
-    /// Back to a state; goals under way end aborted. A snapshot of another robot changes nothing: who asks is refused before
+    /// Restores a state; current goals end `aborted`. A snapshot of another robot changes nothing: such a request is refused before
     /// ([`Snapshot::check_robot`]).
     pub(super) fn put_back(&mut self, snapshot: &Snapshot, out: &mut Vec<Command>) {
         if snapshot.check_robot(&self.robot).is_err() {

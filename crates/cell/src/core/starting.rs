@@ -1,4 +1,4 @@
-//! How goals start: what is refused, and how long the rest will take.
+//! Starts goals: refuses the impossible ones, and computes how long the others take.
 
 use super::activity::{Activity, Kind, Module, Ticket, seconds};
 use super::braking::Way;
@@ -17,16 +17,16 @@ use ratn_perception::noise::MAX_FRAMES;
 
 /// Why the camera is not turned.
 const NO_HEAD: &str = "the robot has no head that turns: its description has no `[head]`";
-/// Why nothing drives.
+/// Why the base does not drive.
 const NO_BASE: &str = "the robot has no base that drives: its description has no `[base]`";
 /// Why there is no picture.
 const NO_CAMERA: &str = "the robot has no camera: its description has no `[camera]`";
 /// Why nothing is grasped.
 const NO_GRIPPER: &str = "the arm has no gripper: its description has none";
-/// How far the camera may look past its target, in radians.
+/// Maximum angle between the camera's view and its target, in radians.
 const MAX_LOOK_ERROR_RAD: f64 = 0.02;
 
-/// Why two modules do not move at once, and what a task does about it.
+/// Why two modules may not move at once, and how a task prevents it.
 const BASE: &str = "nothing else happens while the base drives, so let both states block `Base`";
 const HAND: &str = "an arm does not move while its fingers close, nor before they have parted from what they let go, so let one of both \
                     states block `Arm` and `Gripper`";
@@ -34,7 +34,7 @@ const PICTURE: &str =
     "no picture is taken while the head moves, so let one of both states block `PanTilt` and `Camera`";
 
 impl Cell {
-    /// Starts a goal, of the arm of this number where it is one for an arm or its gripper.
+    /// Starts a goal; `arm` is the arm's number, if it is for an arm or its gripper.
     pub(super) fn start(&mut self, ticket: Ticket, arm: usize, request: Request) -> Result<(), String> {
         if arm >= self.arms.count() {
             return Err(format!("the robot has {} arms, numbered from 0: there is no arm {arm}", self.arms.count()));
@@ -89,7 +89,7 @@ impl Cell {
                 }
                 let from = self.arms.seen_from(arm, &here).finger;
                 let to = self.closes_to(arm, from)?;
-                // What slips out of the fingers lets them close fully.
+                // An object that slips out lets the fingers close fully.
                 self.fingers_keep_apart(arm, from, 0.0)?;
                 self.contacts.closing(arm);
                 (Kind::Close { from, to, object, expected }, self.config.gripper.close_s)
@@ -133,7 +133,8 @@ impl Cell {
         Ok(())
     }
 
-    /// What does not move while an arm does: of its own fingers those that close, and those that have not parted yet from what they let go.
+    /// Checks that nothing moves that has to stand while an arm moves: the base, and the arm's fingers while they close or have not separated from a
+    /// released object.
     fn may_move_arm(&self, arm: usize) -> Result<(), String> {
         self.no_motion_of(Module::Base, BASE)?;
         let finger = self.arms.seen_from(arm, &self.measured()).finger;
@@ -145,8 +146,8 @@ impl Cell {
         self.has_parted(arm)
     }
 
-    /// Whether the fingers of an arm have parted from what they let go, if they did. They need not be moving: what opened them a little has
-    /// ended, or was stopped.
+    /// Checks that the fingers of an arm have separated from the object that they released, if any. They need not be moving: a motion that opened
+    /// them a little may have ended, or been stopped.
     fn has_parted(&self, arm: usize) -> Result<(), String> {
         let finger = self.arms.seen_from(arm, &self.measured()).finger;
         if !self.arms.is_at_what_it_let_go(arm, finger) {
@@ -160,7 +161,7 @@ impl Cell {
         ))
     }
 
-    /// How far each finger will be from the middle, where the fingers of an arm open.
+    /// The target position of an arm's opening fingers, as distance from the middle.
     pub(super) fn opens_fingers_to(&self, arm: usize) -> Option<f64> {
         match self.activities.get(&Module::Gripper(arm))?.kind {
             Kind::Open { to, .. } => Some(to),
@@ -168,10 +169,10 @@ impl Cell {
         }
     }
 
-    /// How far each finger is from the middle where they are so far apart.
+    /// The distance of each finger from the middle for this distance between them.
     ///
     /// # Errors
-    /// When they do not open by going there.
+    /// If the fingers do not open by moving there.
     fn opens_to(&self, arm: usize, width: f64) -> Result<f64, String> {
         let (finger, open) = (self.arms.seen_from(arm, &self.measured()).finger, self.arms.open_finger_m(arm));
         if width / 2.0 > finger && width / 2.0 <= open {
@@ -183,8 +184,8 @@ impl Cell {
         ))
     }
 
-    /// What opening fingers do, and for how long: as fast as if they opened all the way from where they had closed. What they hold they let go, which
-    /// an arm that stands does; else the arm may move meanwhile.
+    /// The opening of fingers and its duration: with the speed of opening completely from where they had closed. An arm that releases an object has
+    /// to stand; otherwise the arm may move meanwhile.
     fn opening(&mut self, arm: usize, to: f64) -> Result<(Kind, f64), String> {
         self.no_motion_of(Module::Base, BASE)?;
         let from = self.arms.seen_from(arm, &self.measured()).finger;
@@ -198,7 +199,7 @@ impl Cell {
         Ok((Kind::Open { from, to }, if part > 0.0 && part < 1.0 { whole_s * part } else { whole_s }))
     }
 
-    /// A trajectory of an arm, checked beside the other arms with their fingers as they are and with those open: neither takes all the room of
+    /// Checks a trajectory of an arm beside the other arms twice, with their fingers at their current positions and open: neither covers the space of
     /// both, because closed fingers are in the middle and open ones are beside it.
     fn checked(&self, arm: usize, here: &Configuration, trajectory: &Trajectory) -> Result<Curve, String> {
         let robot = self.arms.view(arm);
@@ -211,10 +212,10 @@ impl Cell {
         Ok(checked)
     }
 
-    /// What an arm does, and for how long.
+    /// The motion of an arm and its duration.
     ///
     /// # Errors
-    /// Where it would come too close to another arm, or to a head that turns.
+    /// If the arm would come too close to another arm, or to a turning head.
     fn following(&mut self, arm: usize, trajectory: Curve) -> Result<(Kind, f64), String> {
         let lasts_s = trajectory.duration_s();
         let config = self.config.controllers;
@@ -234,7 +235,7 @@ impl Cell {
         Ok((Kind::Follow(Way::Arm(arm, motion)), lasts_s))
     }
 
-    /// What the base does, and for how long.
+    /// The motion of the base and its duration.
     fn driving(&mut self, trajectory: Curve) -> (Kind, f64) {
         let lasts_s = trajectory.duration_s();
         let config = self.config.controllers;
@@ -245,7 +246,7 @@ impl Cell {
             slides: Controller::base_slides(),
         };
         let breaks = self.drive_breaks_off(lasts_s);
-        // A heading is the same after a whole turn: the one that the trajectory begins at.
+        // A heading is the same after a whole turn: the one nearest to the trajectory's start is used.
         let ([x, y, heading], first) = (self.measured().base, trajectory.knots()[0].positions[2]);
         let start = JointVector::of([x, y, first + wrapped(heading - first)]);
         let motion = Motion::new(trajectory, start, controller, breaks);
@@ -260,7 +261,7 @@ impl Cell {
         }
     }
 
-    /// A module for people: of a robot with several arms with the name of its arm.
+    /// The name of a module in messages: for a robot with several arms with the name of its arm.
     fn called(&self, module: Module) -> String {
         match module.arm() {
             Some(arm) if self.arms.count() > 1 => format!("{} of the arm `{}`", module.kind(), self.arms.name(arm)),
@@ -287,7 +288,7 @@ impl Cell {
         Ok([pan, tilt])
     }
 
-    /// How long the head takes, with ramps of the greatest acceleration on the joint that takes longest.
+    /// Duration of a head motion, with ramps at maximum acceleration for the joint that takes longest.
     fn turning_s(&self, from: [f64; 2], to: [f64; 2]) -> f64 {
         let time = |joint: usize, way: f64| {
             let Some(joint) = self.robot.head_joints().get(joint) else { return 0.0 };

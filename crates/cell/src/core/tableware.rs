@@ -1,4 +1,4 @@
-//! The second scene: bowls, forks and cups on a rack, and the places on the table where they shall stand.
+//! The second scene: bowls, forks and cups on a rack, and their places on the table.
 //!
 //! ```text
 //!      left: the table             right: the rack
@@ -7,10 +7,10 @@
 //!   cups        .     .     . |     .     .     .
 //!   forks     |     |     |   |  |     |     |       (the robot is below)
 //! ```
-//! The rack is a board on the right half of the table. On it, as on the left half, there is a row of bowls and, nearer to the robot, a
-//! row of forks that point away from it, with cups in between. Plates lie behind the bowls' places from the beginning: their rims
-//! are too flat for fingers that come from above ([`Model::slips_off`]). Where the rack and the rows are, the robot's description says
-//! (`[workplace.tableware]`). The places are known; where on them things stand is random, and so are their sizes. The same seed lays the same.
+//! The rack is a board on the right half of the table. On it, as on the left half, there is a row of bowls and, nearer to the robot, a row of forks
+//! that point away from it, with cups in between. Plates lie behind the bowls' places from the beginning: their rims are too flat to be grasped from
+//! above ([`Model::slips_off`]). The robot's description defines the rack and the rows (`[workplace.tableware]`). The places are fixed; the objects'
+//! offsets from them and their sizes are random. The same seed gives the same scene.
 
 use super::environment::{Furniture, Kind, Model};
 use super::objects::Placed;
@@ -25,16 +25,16 @@ use ratn_perception::model::Model as Seen;
 /// The rack's name.
 pub const RACK: &str = "rack";
 
-/// How far from its place on the rack something stands at the most, in metres, and how far a fork is turned, in radians.
+/// Maximum distance of an object from its place on the rack, in metres, and maximum rotation of a fork, in radians.
 const SPREAD_M: f64 = 0.008;
 const SPREAD_RAD: f64 = 0.25;
-/// The same of plates, which the table has hardly room for.
+/// The same for plates, for which the table has little room.
 const PLATE_SPREAD_M: f64 = 0.002;
-/// How far things are apart on the rack at the least, and plates, in metres: what the detector needs to find one of them again in a picture
-/// of few frames, and all of them in one of many.
+/// Minimum distance of objects on the rack, and of plates, in metres: the detector needs it to find one of them again in a picture of few frames, and
+/// all of them in one of many.
 const APART_M: f64 = 0.03;
 const PLATES_APART_M: f64 = 0.018;
-/// Least and greatest radius and height of bowls, cups and plates, and length of forks, in metres.
+/// Minimum and maximum radius and height of bowls, cups and plates, and length of forks, in metres.
 const BOWL_RADIUS: [f64; 2] = [0.058, 0.066];
 const BOWL_HEIGHT: [f64; 2] = [0.046, 0.056];
 const FORK_LENGTH: [f64; 2] = [0.17, 0.19];
@@ -43,25 +43,24 @@ const CUP_HEIGHT: [f64; 2] = [0.075, 0.09];
 const PLATE_RADIUS: [f64; 2] = [0.085, 0.086];
 const PLATE_HEIGHT: [f64; 2] = [0.022, 0.026];
 
-/// How far from its place something that was set stands at the most, in metres.
+/// Maximum distance of a set object from its place, in metres.
 const MAX_OFF_PLACE_M: f64 = 0.02;
-/// How far it may lean, and how far a fork may be turned, in radians.
+/// Maximum lean, and maximum rotation of a fork, in radians.
 const MAX_LEAN_RAD: f64 = 0.1;
 const MAX_TURNED_RAD: f64 = 0.15;
 
-/// The rack as something that stands there; `None` where the workplace has none.
+/// The rack as furniture; `None` if the workplace has none.
 pub fn rack(workplace: &Workplace) -> Option<Furniture> {
     let Slab { centre: [x, y, z], size } = workplace.tableware.as_ref()?.rack;
     Some(Furniture { name: RACK.to_owned(), parts: vec![(Pose::at(x, y, z), size)] })
 }
 
-/// The height of an upper face, in metres: rounded, because it is the sum of what people wrote with fewer digits.
+/// The height of an upper face, in metres: rounded, because it is the sum of decimal numbers with fewer digits.
 pub fn top_m(slab: &Slab) -> f64 {
     (slab.top_m() * 1e9).round() / 1e9
 }
 
-/// The places on the table for things of a kind, on its surface; a fork's x axis points to its tips. None where the workplace has no
-/// tableware.
+/// The places on the table for objects of a kind, on its surface; a fork's x axis points to its tips. Empty if the workplace has no tableware.
 pub fn places(workplace: &Workplace, kind: Kind) -> Vec<Pose> {
     let Some(tableware) = &workplace.tableware else { return Vec::new() };
     let (first, between) = match rows(tableware, kind) {
@@ -71,7 +70,7 @@ pub fn places(workplace: &Workplace, kind: Kind) -> Vec<Pose> {
     row(first, between, top_m(&workplace.table))
 }
 
-/// Whether something stands, or lies, at a place of its kind on the table.
+/// Whether an object stands, or lies, at a place for its kind on the table.
 pub fn is_in_place(workplace: &Workplace, kind: Kind, pose: &Pose) -> bool {
     let upright = pose.rotate([0.0, 0.0, 1.0])[2] >= MAX_LEAN_RAD.cos();
     let ahead = pose.rotate([1.0, 0.0, 0.0])[0] >= MAX_TURNED_RAD.cos();
@@ -81,12 +80,12 @@ pub fn is_in_place(workplace: &Workplace, kind: Kind, pose: &Pose) -> bool {
         && places(workplace, kind).iter().any(|place| off(place) <= MAX_OFF_PLACE_M)
 }
 
-/// Whether the camera tells things from each other: every round one from all others.
+/// Whether the camera can separate the objects: every round one from all others.
 pub(super) fn are_apart(placed: &[Placed]) -> bool {
     let apart = |round: &Placed, other: &Placed| {
         let [x, y, _] = other.pose.inverse().compose(&round.pose).position;
         let (between, reach) = match other.model.kind {
-            // From the middle of the round one to the nearest of a fork's middle line.
+            // From the centre of the round object to the nearest point of the fork's centre line.
             Kind::Fork => {
                 let [length, width, _] = other.model.size;
                 ((x.abs() - length / 2.0).max(0.0).hypot(y), width / 2.0)
@@ -121,7 +120,7 @@ pub(super) fn lay(workplace: &Workplace, goods: Goods, random: &mut impl Rng) ->
     placed
 }
 
-/// The places on the rack for things of a kind, on its surface.
+/// The places on the rack for objects of a kind, on its surface.
 fn on_rack(workplace: &Workplace, kind: Kind) -> Vec<Pose> {
     let Some(tableware) = &workplace.tableware else { return Vec::new() };
     let first = rows(tableware, kind).map(|rows| rows.rack);
@@ -132,7 +131,7 @@ fn row([x, y]: [f64; 2], between: f64, height: f64) -> Vec<Pose> {
     (0..MAX_TABLEWARE).map(|i| Pose::at(x, y + between * i as f64, height)).collect()
 }
 
-/// The rows of a kind; plates have one on the table alone.
+/// The rows of a kind; `None` for plates, which have only a row on the table.
 fn rows(tableware: &Tableware, kind: Kind) -> Option<Rows> {
     match kind {
         Kind::Fork => Some(tableware.forks),
@@ -142,7 +141,7 @@ fn rows(tableware: &Tableware, kind: Kind) -> Option<Rows> {
     }
 }
 
-/// One of random size.
+/// A model of random size.
 fn model(kind: Kind, random: &mut impl Rng) -> Model {
     let (radius, height) = match kind {
         Kind::Fork => return Model { kind, size: Seen::Fork { length: within(FORK_LENGTH, random) }.size() },

@@ -1,6 +1,6 @@
-//! Which motions arm and base follow: those that their controllers find nothing wrong with, by what controllers know. That is the trajectory's
-//! form and limits, where the joints are by their encoders, the robot's own body, and the area in which it may drive. What else stands there they
-//! do not know: whether the robot meets it is for the physics to say ([`super::contacts`]).
+//! Checks the trajectories of arm and base as a controller can: the trajectory's form and limits, the measured joint positions, the robot's own body,
+//! and the area in which it may drive. A controller does not know the other bodies in the cell: the physics decides whether the robot touches them
+//! ([`super::contacts`]).
 
 use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
@@ -14,10 +14,10 @@ use ratn_motion::trajectory::Curve;
 use ratn_motion::validate::validate_trajectory;
 use ratn_world::scene::Scene;
 
-/// The longest motion, in seconds: every posture of it is checked before it begins.
+/// Maximum duration of a motion, in seconds: every posture is checked before it begins.
 const MAX_MOTION_S: f64 = 600.0;
 
-/// The trajectory, ready to be followed from `here`, as measured.
+/// The trajectory, ready to be followed from the measured configuration `here`.
 ///
 /// # Errors
 /// Why it may not be followed.
@@ -37,7 +37,7 @@ pub(crate) fn check_base(robot: &Robot, here: &Configuration, trajectory: &Traje
         .map_err(|violation| format!("the trajectory is refused: {violation}"))
 }
 
-/// What a controller knows of what stands around the robot.
+/// The controller's scene of the robot's surroundings: empty.
 fn nothing() -> Scene {
     Scene { base: Pose::IDENTITY, objects: Vec::new() }
 }
@@ -50,15 +50,15 @@ fn is_short(trajectory: &Trajectory) -> Result<(), String> {
     Err(format!("the trajectory is refused: it lasts {lasts_s:.0} s, a motion lasts at most {MAX_MOTION_S} s"))
 }
 
-/// The straight line of joint space to a posture, which joints that turn without end take in the turn that is nearest.
+/// The straight line in joint space to a posture; continuous joints use the nearest turn.
 ///
 /// # Errors
-/// When the speed is none.
+/// If the speed is out of its range.
 pub(crate) fn straight(robot: &Robot, from: &JointVector, to: &JointVector, speed: f64) -> Result<Trajectory, String> {
     if !(MIN_SPEED..=1.0).contains(&speed) {
         return Err(format!("a speed of {speed} is none: it is a fraction of the limits, from {MIN_SPEED} to 1"));
     }
-    // A line without corners to round.
+    // A line has no corners to round.
     let joints = robot.arm_joints();
     let to = JointVector::from_fn(joints.len(), |j| joints[j].counted_from(from[j], to[j]));
     Ok(parameterise(robot, &[Section::AsGiven(vec![*from, to])], speed, &mut |_, _| false))

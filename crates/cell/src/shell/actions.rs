@@ -1,4 +1,4 @@
-//! The actions of the modules that the robot has: reads a goal's inputs, has the core do it, writes its outputs.
+//! The actions of the robot's modules: reads a goal's inputs, has the core perform it, writes its outputs.
 
 use super::cell_actor::CellHandle;
 use crate::config::CellConfig;
@@ -17,10 +17,10 @@ use ratn_worker::client::Channels;
 use ratn_worker::lease_watch::LeaseWatch;
 use ratn_worker::safety::Safety;
 
-/// How fast `move_to` goes unless told otherwise, as a fraction of the limits: a line that nobody planned is taken with care.
+/// The default speed of `move_to`, as a fraction of the limits: slow, because the line was not planned.
 const MOVE_TO_SPEED: f64 = 0.2;
 
-/// The id of a module's resource on a host, `pan-tilt@sim`; of a robot with several arms `arm_right@sim` and `gripper_right@sim`.
+/// The id of a module's resource on a host, `pan-tilt@sim`; for a robot with several arms `arm_right@sim` and `gripper_right@sim`.
 pub(crate) fn resource_id(module: Module, robot: &Robot, host: &str) -> String {
     let name = match module {
         Module::Base => "base",
@@ -35,12 +35,12 @@ pub(crate) fn resource_id(module: Module, robot: &Robot, host: &str) -> String {
     }
 }
 
-/// The watch of who holds the modules.
+/// The watch of the leases of the modules.
 pub(crate) fn leases(handle: &CellHandle, config: &CellConfig) -> LeaseWatch {
     LeaseWatch::of(handle.modules().iter().map(|module| resource_id(*module, handle.robot(), &config.host)))
 }
 
-/// The server of all modules. Each takes one goal at a time, under a lease of its own resource.
+/// The action server of all modules. Each performs one goal at a time, under a lease of its own resource.
 pub(crate) fn server(
     handle: &CellHandle,
     config: &CellConfig,
@@ -78,7 +78,7 @@ pub(crate) fn server(
 
 type Read = fn(&GoalContext) -> Result<Request, ActionFailure>;
 
-/// All modules are behind one server: no two actions have the same name. An action of the arm is one of every arm.
+/// One server serves all modules: no two actions have the same name. An action of the arm is offered by every arm.
 const ACTIONS: [(Module, &str, &str, Read); 10] = [
     (Module::Base, "drive", "moves the base along a trajectory", |goal| {
         Ok(Request::Drive { trajectory: goal.input_trajectory("trajectory")?.clone() })
@@ -117,27 +117,27 @@ fn configuration_value(at: &Configuration) -> Value {
     Value::List(at.values().into_iter().map(Value::Float).collect())
 }
 
-/// What a drive measures: where the base believes to stand at its stop.
+/// The key of the fact that a drive measures: the localised pose of the base at its stop.
 fn stands() -> FactKey {
     FactKey { predicate: "at".to_owned(), arguments: vec![Term::Name("base".to_owned())] }
 }
 
 /// A module that performs an action.
 struct Performer {
-    /// The number of its arm.
+    /// The number of the module's arm.
     arm: usize,
-    /// The name of its arm, of a robot with several.
+    /// The name of the module's arm, if the robot has several.
     arm_name: Option<String>,
-    /// The id of its resource.
+    /// The id of the module's resource.
     resource: String,
 }
 
 struct ModuleAction {
-    /// The kind of resource that performs it.
+    /// The kind of resource that performs the action.
     kind: &'static str,
     name: &'static str,
     description: &'static str,
-    /// The modules that can do it, at least one: of a robot with several arms one for each.
+    /// The modules that can perform it, at least one: for a robot with several arms one per arm.
     performers: Vec<Performer>,
     handle: CellHandle,
     seed: u64,
@@ -202,11 +202,11 @@ impl Action for ModuleAction {
                 biased;
                 ending = motion.ended() => break ending,
                 () = goal.cancelled.cancelled() => match motion.stop().await {
-                    // It had been done before the word came.
+                    // The goal had succeeded before the cancel arrived.
                     Ok(Ending::Done(product)) => break Ok(Ending::Done(product)),
                     _ => return Err(goal.stopped()),
                 },
-                // The sender is in the goal.
+                // The goal owns the sender, so this cannot fail.
                 _ = suspended.changed() => {}
             }
         };
@@ -220,11 +220,11 @@ impl Action for ModuleAction {
 }
 
 impl ModuleAction {
-    /// The module that a goal is for: that of the arm which the input `arm` names; without this input the one whose resource the lease holds. A
-    /// module that is no arm's, and that of a robot with one arm, ignores the input.
+    /// The module that performs a goal: that of the arm which the input `arm` names; without this input the module whose resource the lease holds. A
+    /// module that belongs to no arm, or to the only arm, ignores the input.
     ///
     /// # Errors
-    /// [`NoResource`] where no module of such an arm does this, or the lease holds none or several of the resources.
+    /// [`NoResource`] if no module of such an arm performs this action, or the lease holds none or several of the resources.
     fn performer(&self, arm: Option<&Value>, lease: Option<&Lease>) -> Result<&Performer, NoResource> {
         let of_arms: Vec<&str> = self.performers.iter().filter_map(|one| one.arm_name.as_deref()).collect();
         let named = match arm.filter(|_| !of_arms.is_empty()) {

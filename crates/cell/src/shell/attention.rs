@@ -1,36 +1,36 @@
-//! Whether the cell has followed its clock. Where its process was suspended, or the machine had no time for it, whoever held the robot may have
-//! lost it meanwhile, and another may hold it by now.
+//! Detects that the cell's process did not run for a while. If it was suspended, or got no processor time, the leases of the robot's modules may have
+//! ended meanwhile, and others may hold the modules by now.
 //!
 //! ```text
-//!   follows ── a look comes MOST_MISSED later than it was to ──▶ rests: what moved has braked since the last look, and stands
-//!      ▲                                                           │
-//!      └────── REST later: the leases were heard of meanwhile ─────┘
+//! runs ── a look at the clock is more than MOST_MISSED late ──▶ rests: everything that moved has braked since the last look, and stands
+//!   ▲                                                         │
+//!   └──── after REST: the lease watch is up to date again ───┘
 //! ```
 
 use ratn_model::time::Timestamp;
 use std::time::{Duration, Instant};
 
-/// It may miss so much: less than any lease that has ended keeps the robot from the next holder.
+/// Maximum delay that is accepted: less than the time for which an ended lease keeps a module from its next holder.
 const MOST_MISSED: Duration = Duration::from_secs(2);
-/// So long it rests when it missed more: the watch of the leases, which was suspended, too, is told of all that has happened within this.
+/// Duration of the rest after a longer delay: within this time the lease watch, which was suspended as well, receives everything that has happened.
 const REST: Duration = Duration::from_secs(1);
 
-/// See the module.
+/// See the module's description.
 #[derive(Debug)]
 pub(super) struct Attention {
-    /// The last look, in wall time and in the robot's.
+    /// The time of the last look, in wall time and in the robot's time.
     last: (Instant, Timestamp),
     rests_until: Option<Instant>,
 }
 
-/// What a look at the clock shows.
+/// The result of a look at the clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Seen {
-    /// All is as it was.
+    /// Nothing has changed.
     Nothing,
-    /// It has missed too much since this moment of the robot's time: from then on the robot is to rest.
+    /// The process has not run since this moment of the robot's time: the robot rests from then on.
     Missed(Timestamp),
-    /// It has rested.
+    /// The rest is over.
     Rested,
 }
 
@@ -40,7 +40,7 @@ impl Attention {
         Attention { last: (at, now), rests_until: None }
     }
 
-    /// The next look, of a cell that meant to sleep so long at the most since the last one.
+    /// The next look; since the last one the cell meant to sleep at most `slept`.
     pub(super) fn looks(&mut self, at: Instant, now: Timestamp, slept: Duration) -> Seen {
         let (last, since) = std::mem::replace(&mut self.last, (at, now));
         if at.saturating_duration_since(last) > slept + MOST_MISSED {
@@ -53,7 +53,7 @@ impl Attention {
         }
     }
 
-    /// Whether it rests.
+    /// Whether the robot rests.
     pub(super) fn rests(&self) -> bool {
         self.rests_until.is_some()
     }
@@ -72,7 +72,7 @@ mod tests {
         assert_eq!(attention.looks(begin + 6 * second, robot(16.0), second), Seen::Missed(robot(12.0)));
         assert!(attention.rests());
         assert_eq!(attention.looks(begin + 13 * second / 2, robot(16.5), second), Seen::Nothing);
-        // It is late again.
+        // The look is late again.
         assert_eq!(attention.looks(begin + 20 * second, robot(30.0), second), Seen::Missed(robot(16.5)));
         assert_eq!(attention.looks(begin + 41 * second / 2, robot(30.5), second), Seen::Nothing);
         assert_eq!(attention.looks(begin + 21 * second, robot(31.0), second), Seen::Rested);

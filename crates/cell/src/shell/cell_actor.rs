@@ -1,4 +1,4 @@
-//! The owner of the cell's core: a thread that performs messages in their order and wakes when the core says.
+//! The owner of the cell's core: a thread that handles messages in order and wakes when the core asks for it.
 //!
 //! A thread, not a task: checking a trajectory takes milliseconds, and a motion has to stop on time whatever the runtime does.
 
@@ -32,14 +32,14 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
 use crate::core::objects::TrueObject;
 
-/// Messages that wait for the handle at the most, besides one per goal that tells it to stop.
+/// Maximum number of messages in the queue, not counting one stop message per goal.
 const MAX_MESSAGES: usize = 256;
-/// It looks at the clock at least this often.
+/// Maximum time between two looks at the clock.
 const MAX_SLEEP: Duration = Duration::from_secs(1);
-/// … and so often while something moves: what is not computed meanwhile makes the end of a motion late.
+/// The same while something moves: steps that are left to compute delay the end of a motion.
 const RESTLESS_SLEEP: Duration = Duration::from_millis(5);
 
-/// What the cell knows.
+/// The true state of the cell.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct State {
     pub(crate) objects: Vec<TrueObject>,
@@ -48,11 +48,11 @@ pub(crate) struct State {
     pub(crate) base: Pose,
     pub(crate) now: Timestamp,
     pub(crate) seed: u64,
-    /// What touched that should not have.
+    /// The unintended contacts.
     pub(crate) contacts: Vec<Contact>,
 }
 
-/// Sends messages to the handle. Clones share it; it ends with the last of them.
+/// Sends messages to the cell's thread. Clones share it; the thread ends when the last clone is dropped.
 #[derive(Debug, Clone)]
 pub(crate) struct CellHandle {
     messages: Sender<QueuedMessage>,
@@ -61,7 +61,7 @@ pub(crate) struct CellHandle {
     optics: Arc<Optics>,
 }
 
-/// A goal under way. Dropped before its end, it stops: nothing moves that nobody waits for.
+/// A goal that is being performed. Dropping it stops the goal: nothing moves without a client that waits for it.
 #[derive(Debug)]
 pub(crate) struct Motion {
     ticket: Ticket,
@@ -77,16 +77,16 @@ struct Optics {
     noise: Noise,
 }
 
-/// Why the robot is to stand still.
+/// The reasons for the robot to stand still.
 #[derive(Debug, Default)]
 struct Holds {
     safety: SafetyState,
     suspended: BTreeSet<Ticket>,
-    /// The cell has missed too much.
+    /// The cell's process did not run for too long.
     rests: bool,
 }
 
-/// The handle does not take the message.
+/// Why a message was not accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum CellActorError {
     #[error("the cell is overloaded: {MAX_MESSAGES} messages wait; try again later")]
@@ -95,7 +95,7 @@ pub(crate) enum CellActorError {
     Ended,
 }
 
-/// A message with the room that it takes in the queue.
+/// A message with its permit, which is its place in the queue.
 struct QueuedMessage {
     message: Message,
     _room: Option<OwnedSemaphorePermit>,
@@ -112,7 +112,7 @@ enum Message {
     Save(oneshot::Sender<Box<Snapshot>>),
 }
 
-/// Starts the thread.
+/// Starts the cell's thread.
 pub(crate) fn start(cell: Cell, recorder: Recorder, clock: RobotClock, vitals: Vitals) -> io::Result<CellHandle> {
     let (handle, inbox) = handle_of(&cell);
     let keep = move || {
@@ -130,7 +130,7 @@ fn handle_of(cell: &Cell) -> (CellHandle, Receiver<QueuedMessage>) {
 }
 
 impl CellHandle {
-    /// What the robot has.
+    /// The modules of the robot.
     pub(crate) fn modules(&self) -> Vec<Module> {
         Module::of(&self.optics.robot)
     }
@@ -140,13 +140,13 @@ impl CellHandle {
         &self.optics.robot
     }
 
-    /// Starts a goal of the first arm, or one that is for no arm.
+    /// Starts a goal for the first arm, or one that is for no arm.
     #[cfg(test)]
     pub(crate) fn perform(&self, request: Request) -> Result<Motion, CellActorError> {
         self.perform_with(crate::core::arms::FIRST, request)
     }
 
-    /// Starts a goal, of the arm of this number where it is one for an arm or its gripper.
+    /// Starts a goal; `arm` is the arm's number, if it is for an arm or its gripper.
     pub(crate) fn perform_with(&self, arm: usize, request: Request) -> Result<Motion, CellActorError> {
         let ticket = Ticket(self.tickets.fetch_add(1, Ordering::Relaxed) + 1);
         let (ended, ending) = oneshot::channel();
@@ -154,46 +154,46 @@ impl CellHandle {
         Ok(Motion { ticket, ending, messages: self.messages.clone(), suspended: false, over: false })
     }
 
-    /// Tells the core of an event, as soon as there is room.
+    /// Sends an event to the core, as soon as the queue has room.
     pub(crate) async fn tell(&self, event: Event) -> Result<(), CellActorError> {
         let room = Arc::clone(&self.room).acquire_owned().await.map_err(|_| CellActorError::Ended)?;
         self.send(Message::Happened(event), room)
     }
 
-    /// A new table; what is true then.
+    /// Lays a new scene; returns its true state.
     pub(crate) async fn reset(&self, seed: u64, goods: Goods) -> Result<State, CellActorError> {
         let (state, answer) = oneshot::channel();
         self.ask(Message::Reset { seed, goods, state })?;
         answer.await.map_err(|_| CellActorError::Ended)
     }
 
-    /// The state now.
+    /// A snapshot of the current state.
     pub(crate) async fn save(&self) -> Result<Box<Snapshot>, CellActorError> {
         let (snapshot, answer) = oneshot::channel();
         self.ask(Message::Save(snapshot))?;
         answer.await.map_err(|_| CellActorError::Ended)
     }
 
-    /// Something shall go wrong; false where too much is to go wrong already.
+    /// Injects a fault; returns false if too many are scheduled already.
     pub(crate) async fn inject(&self, fault: Fault) -> Result<bool, CellActorError> {
         let (taken, answer) = oneshot::channel();
         self.ask(Message::Fault { fault, taken })?;
         answer.await.map_err(|_| CellActorError::Ended)
     }
 
-    /// What is true now.
+    /// The true state now.
     pub(crate) async fn state(&self) -> Result<State, CellActorError> {
         let (state, answer) = oneshot::channel();
         self.ask(Message::State(state))?;
         answer.await.map_err(|_| CellActorError::Ended)
     }
 
-    /// Makes an image of what was in front of the camera. Blocks for milliseconds per exposure.
+    /// Renders the image of the scenes in front of the camera. Blocks for milliseconds per exposure.
     pub(crate) fn develop(&self, camera: &Camera, seed: u64, exposures: &[Exposure]) -> DepthImage {
         develop(&self.optics.robot, camera, &self.optics.noise, seed, exposures)
     }
 
-    /// Sends a message that can be refused.
+    /// Sends a message that is refused if the queue is full.
     fn ask(&self, message: Message) -> Result<(), CellActorError> {
         let room = Arc::clone(&self.room).try_acquire_owned().map_err(|_| CellActorError::Overloaded)?;
         self.send(message, room)
@@ -206,7 +206,7 @@ impl CellHandle {
 
 #[tonic::async_trait]
 impl Brakes for CellHandle {
-    /// Never refused for want of room.
+    /// Never refused because the queue is full.
     async fn apply(&self, state: &SafetyState) -> Result<(), String> {
         let (applied, done) = oneshot::channel();
         let message = Message::Safety { state: state.clone(), applied };
@@ -216,7 +216,7 @@ impl Brakes for CellHandle {
 }
 
 impl Motion {
-    /// How it ends.
+    /// Waits for the end of the goal.
     pub(crate) async fn ended(&mut self) -> Result<Ending, CellActorError> {
         let ending = (&mut self.ending).await.map_err(|_| CellActorError::Ended);
         self.over = true;
@@ -224,17 +224,17 @@ impl Motion {
         ending
     }
 
-    /// Has the robot stand still until this is taken back or the goal has ended. What suspends one goal suspends those of every module:
-    /// the resource manager is not heard.
+    /// Holds the robot until this is taken back or the goal has ended. One suspended goal holds all modules, because its reason is that the
+    /// resource manager is not heard.
     pub(crate) fn suspend(&mut self, suspended: bool) {
         if std::mem::replace(&mut self.suspended, suspended) != suspended {
             let message = Message::Suspend { ticket: self.ticket, suspended };
-            // A handle that has ended moves nothing.
+            // If the cell's thread has ended, nothing moves.
             let _ = self.messages.send(QueuedMessage { message, _room: None });
         }
     }
 
-    /// Tells it to stop, and how it ends then. Never refused: there is at most one such message per goal.
+    /// Stops the goal and waits for its end. Never refused: there is at most one such message per goal.
     pub(crate) async fn stop(mut self) -> Result<Ending, CellActorError> {
         self.tell_to_stop();
         self.ended().await
@@ -243,7 +243,7 @@ impl Motion {
     fn tell_to_stop(&mut self) {
         self.over = true;
         let stop = Event::Stop { ticket: self.ticket, reason: "the goal was told to stop".to_owned() };
-        // A handle that has ended moves nothing.
+        // If the cell's thread has ended, nothing moves.
         let _ = self.messages.send(QueuedMessage { message: Message::Happened(stop), _room: None });
         self.suspend(false);
     }
@@ -266,7 +266,7 @@ impl Holds {
         }
     }
 
-    /// What is to be in force.
+    /// The state that has to be in force.
     fn state(&self) -> SafetyState {
         match &self.safety {
             SafetyState::Ready if !self.suspended.is_empty() => {
@@ -293,33 +293,33 @@ fn keep(cell: Cell, recorder: Recorder, clock: RobotClock, inbox: &Receiver<Queu
     }
 }
 
-/// The core with whoever waits for what it does.
+/// The core, with the clients that wait for its replies.
 struct Keeper {
     cell: Cell,
     recorder: Recorder,
     waiting: BTreeMap<Ticket, oneshot::Sender<Ending>>,
     holds: Holds,
-    /// Who waits until what was told to stand stands.
+    /// Callers that wait until the robot stands.
     applying: Vec<oneshot::Sender<()>>,
     attention: Attention,
 }
 
 impl Keeper {
-    /// Begins at this moment, in wall time and in the robot's.
+    /// Begins at this moment, in wall time and in the robot's time.
     fn begin(cell: Cell, recorder: Recorder, at: Instant, now: Timestamp) -> Keeper {
         let attention = Attention::begins(at, now);
         let (waiting, holds, applying) = Default::default();
         Keeper { cell, recorder, waiting, holds, applying, attention }
     }
 
-    /// How long it may be left alone, in wall time.
+    /// How long the thread may sleep, in wall time.
     fn sleep(&self, clock: &RobotClock) -> Duration {
         let is_restless = self.cell.is_restless() || self.attention.rests();
         let most = if is_restless { RESTLESS_SLEEP } else { MAX_SLEEP };
         self.cell.next_wake().map_or(most, |moment| clock.until(moment).min(most))
     }
 
-    /// A message, or that it is time to look at the clock, at this moment of wall time and of the robot's; `slept` is how long it meant to sleep.
+    /// Handles a message, or a tick without one, at this moment of wall time and of the robot's time; `slept` is how long the thread meant to sleep.
     fn turn(&mut self, at: Instant, now: Timestamp, slept: Duration, message: Option<Message>) {
         match self.attention.looks(at, now, slept) {
             Seen::Nothing => {}
@@ -371,7 +371,7 @@ impl Keeper {
             }
         };
         let saved = self.give(now, event);
-        // Whoever asked may be gone.
+        // The caller may be gone.
         if let Some((saving, snapshot)) = saving.zip(saved) {
             let _ = saving.send(snapshot);
         }
@@ -386,7 +386,7 @@ impl Keeper {
         }
     }
 
-    /// Gives the core an event, and tells what comes of it. What it has saved, where that was asked for.
+    /// Sends the core an event and forwards its commands. Returns the snapshot, if the event asked for one.
     fn give(&mut self, now: Timestamp, event: Event) -> Option<Box<Snapshot>> {
         let recorded = self.recorder.is_on().then(|| event.clone());
         let commands = self.cell.handle(now, event);
@@ -398,7 +398,7 @@ impl Keeper {
             match command {
                 Command::Ended { ticket, ending, .. } => {
                     if let Some(ended) = self.waiting.remove(&ticket) {
-                        // Whoever asked may be gone.
+                        // The caller may be gone.
                         let _ = ended.send(ending);
                     }
                 }
@@ -445,7 +445,7 @@ mod tests {
             let confirmed = handle.state().await.unwrap();
             let later = handle.state().await.unwrap();
             assert_eq!(confirmed.arm, later.arm, "{state:?}");
-            // It was on its way when that was asked for, and braked.
+            // It was moving when the hold was requested, and braked.
             assert!(confirmed.now.since(told.now) > Duration::from_millis(40), "{state:?}");
             assert!((confirmed.arm[0] - told.arm[0]).abs() > 1e-3, "{state:?}");
             drop(motion);
@@ -468,7 +468,7 @@ mod tests {
             turn(&mut keeper, ms);
         }
         let suspended = turn(&mut keeper, 500);
-        // Time enough to come to the end.
+        // More time than the motion needs.
         let continued = turn(&mut keeper, 30_000);
         let way = |from: JointVector, to: JointVector| (to[0] - from[0]).abs();
         assert!(way(before, suspended) > 1e-3 && way(suspended, continued) < 0.2 && keeper.cell.stands());

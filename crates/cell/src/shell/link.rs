@@ -1,5 +1,5 @@
-//! The link to the resource manager: a session, the modules and the battery as resources under it, the watch of leases.
-//! Follows the manager when it comes back somewhere else.
+//! The link to the resource manager: a session, the modules and the battery as its resources, and the lease watch. It reconnects when the manager
+//! returns at another endpoint.
 
 use super::actions::resource_id;
 use super::cell_actor::CellHandle;
@@ -21,33 +21,33 @@ use tokio_util::sync::CancellationToken;
 
 /// The role of the resource manager in the runtime directory.
 const RESOURCE_MANAGER: &str = "resource-manager";
-/// How long one wait for its endpoint file lasts; then it is looked for again.
+/// How long one wait for the manager's endpoint file lasts, before it is looked for again.
 const FIND_DEADLINE: Duration = Duration::from_secs(60);
-/// The kind of the resource that the middle of a workplace is, into which several arms reach.
+/// The kind of the resource for the middle of a workplace, which several arms can reach.
 pub const MIDDLE: &str = "Middle";
 
-/// How often the battery is looked at, and whether the manager has moved.
+/// Interval for reading the battery and for checking whether the manager has moved.
 const LOOK_INTERVAL: Duration = Duration::from_millis(500);
-/// The battery's level is told again when it has changed by this much.
+/// The battery's level is updated when it has changed by this much.
 const LEVEL_STEP: f64 = 0.01;
 
 pub(crate) struct Link {
     pub(crate) config: CellConfig,
     pub(crate) directory: RuntimeDirectory,
     pub(crate) channels: Channels,
-    /// Where the modules' actions are served.
+    /// The endpoint of the modules' actions.
     pub(crate) endpoint: Endpoint,
     pub(crate) handle: CellHandle,
-    /// Who holds the modules.
+    /// The watch of the modules' leases.
     pub(crate) leases: LeaseWatch,
-    /// Who performs their goals.
+    /// The server of the modules' goals.
     pub(crate) server: ActionServer,
-    /// How long goals have to end in, at the end.
+    /// Time that goals have to end in at the shutdown.
     pub(crate) patience: Duration,
 }
 
 impl Link {
-    /// Keeps the link until `shutdown`; then everything is stopped, and the session ends when nothing moves any more.
+    /// Keeps the link until `shutdown`; then all goals are stopped, and the session is closed when nothing moves any more.
     pub(crate) async fn keep(self, shutdown: CancellationToken) {
         while !shutdown.is_cancelled() {
             let Some(Some(manager)) = shutdown.run_until_cancelled(self.find()).await else { continue };
@@ -63,7 +63,7 @@ impl Link {
             // The modules, and every lease of them, end with the session.
             self.leases.lost("the cell's session with the resource manager has ended");
             session.close().await;
-            // Gives a manager that refuses time to come to its senses.
+            // Waits before it asks a manager that refused again.
             let _ = shutdown.run_until_cancelled(tokio::time::sleep(LOOK_INTERVAL)).await;
         }
     }
@@ -90,7 +90,7 @@ impl Link {
         }
     }
 
-    /// Offers everything and keeps the battery's level up to date, until the manager is somewhere else.
+    /// Offers all resources and keeps the battery's level up to date, until the manager has moved.
     async fn offer(&self, manager: &Endpoint, session: &Session) -> Result<(), CallError> {
         let provider = Provider::start_at_rest(&self.channels, manager, session, &self.leases)?;
         let patience = Duration::from_millis(self.config.session_ttl_ms);
@@ -128,13 +128,13 @@ impl Link {
         tokio::select! {
             offered = offering => offered,
             () = watching => Ok(()),
-            // The next one has another id.
+            // The next session has another id.
             () = session.taken() => Ok(()),
         }
     }
 
     fn middle(&self) -> Resource {
-        // Whose run is gone may have an arm there that still brakes.
+        // An arm of a run that is gone may still be braking there.
         Resource::new(format!("middle@{}", self.config.host), ResourceClass::System, MIDDLE)
             .with_standstill(self.config.standstill())
             .on_host(&self.config.host)

@@ -2,10 +2,10 @@
 //!
 //! ```text
 //!   lease watch ─▶ action service ─┐                                      ┌─▶ outcome of the goal
-//!                                  ├─event─▶ handle.rs (Cell, a clock) ───┤
+//!                                  ├─event─▶ cell_actor.rs (Cell, clock) ─┤
 //!   cell service ──────────────────┘         wakes when the core says     └─▶ ground truth
 //! ```
-//! The handle's thread owns the core; everything else sends it messages.
+//! The cell's thread owns the core; all other tasks send it messages.
 
 mod actions;
 mod attention;
@@ -30,23 +30,23 @@ use ratn_worker::tls::ClientTls;
 use recorder::Recorder;
 use tokio_util::sync::CancellationToken;
 
-/// The role's name: of its endpoint file, its command and its section of a config.
+/// The role's name: for its endpoint file, its command and its section of a config.
 pub const ROLE: &str = "cell";
 
-/// In the state directory while an emergency stop is in force: a cell that is started again, also after a reboot, is still stopped.
+/// This file exists in the state directory while an emergency stop is in force: a restarted cell, also after a reboot, is still stopped.
 const STOPPED_FILE: &str = "stopped";
-/// Where earlier versions had it, in the runtime directory.
+/// The name of that file in the runtime directory, where earlier versions had it.
 const EARLIER_STOPPED_FILE: &str = "cell.stopped";
 
-/// Serves until `shutdown` is cancelled. The modules' resources are there as soon as the resource manager is.
+/// Serves until `shutdown` is cancelled. The modules' resources are offered as soon as the resource manager is available.
 ///
 /// # Errors
-/// Where the config is none, where it cannot listen or publish its endpoint, or where serving fails.
+/// If the config is invalid, if it cannot listen or publish its endpoint, or if serving fails.
 pub async fn run(config: CellConfig, directory: RuntimeDirectory, shutdown: CancellationToken) -> anyhow::Result<()> {
     run_as(config, directory, Serving::default(), ClientTls::none(), shutdown).await
 }
 
-/// As [`run`], served as its host wants it; `tls` is what it trusts and shows as a client.
+/// As [`run`], with the host's serving options; `tls` is its TLS configuration as a client.
 ///
 /// # Errors
 /// As [`run`].
@@ -73,7 +73,7 @@ pub async fn run_as(
     let channels = Channels::new(&tls);
     let safety = safety(&config, &directory, &handle).await?;
     let leases = actions::leases(&handle, &config);
-    // A simulated robot ends with its process: this one has not moved yet.
+    // A simulated robot ends with its process: this new one has not moved yet.
     leases.brought_to_rest();
     let server = actions::server(&handle, &config, channels.clone(), safety.clone(), &leases);
     let services = Services::new()
@@ -102,7 +102,7 @@ pub async fn run_as(
     Ok(served?)
 }
 
-/// The safety of the cell, stopped where a stop was in force when the one before ended. Nothing has moved yet.
+/// The safety of the cell: stopped if a stop was in force when the previous process ended. Nothing has moved yet.
 async fn safety(
     config: &CellConfig,
     directory: &RuntimeDirectory,

@@ -1,4 +1,4 @@
-//! Whether the live cell keeps pace with the robot's clock, and comes to the same as one that goes as fast as it can.
+//! Checks that the live cell keeps pace with the robot's clock, and gives the same results as one that runs as fast as it can.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test may panic and print")]
 
@@ -22,7 +22,7 @@ use ratn_motion::robot::Configuration;
 use ratn_worker::robot_clock::RobotClock;
 use std::time::{Duration, Instant};
 
-/// Where the base drives to and from, with the arm folded.
+/// The two places between which the base drives, with the arm folded.
 const PLACES: [[f64; 3]; 2] = [[0.0; 3], [-2.0, 0.5, 1.5]];
 
 fn config(boxes: usize, faults: &[&str]) -> CellConfig {
@@ -48,7 +48,7 @@ fn saved(cell: &mut Cell, now: Timestamp) -> Box<Snapshot> {
 async fn a_cell_at_fifty_times_and_one_as_fast_as_possible_come_to_the_same_to_the_last_bit() {
     let place = tempfile::tempdir().unwrap();
     let file = place.path().join("live.jsonl");
-    // Boxes that are put down elsewhere, and a camera that is blind by chance: physics, and draws.
+    // Boxes that are moved by faults, and a camera that fails at random: both physics and random draws.
     let config = config(3, &["object_moved@1", "object_moved@6.3", "sensor_dropout~0.5"]);
     let cell = Cell::new(config.clone()).unwrap();
     let recorder = Recorder::begin(&file, &cell).unwrap();
@@ -93,7 +93,7 @@ fn loaded(config: CellConfig) -> Cell {
 
 fn way(cell: &Cell, from: [f64; 3], to: [f64; 3]) -> Trajectory {
     let mut scene = cell.scene();
-    // Everything but the table rides along.
+    // Everything but the table rides on the base.
     scene.objects.retain(|object| object.name == "table");
     let request = DriveRequest {
         start: Configuration { base: from, arm: aimm::STOWED, ..assumed(cell.robot(), &scene) },
@@ -107,7 +107,7 @@ fn way(cell: &Cell, from: [f64; 3], to: [f64; 3]) -> Trajectory {
     plan_drive(cell.robot(), &scene, &request, &mut |_| Control::Continue).unwrap().trajectory
 }
 
-/// What is measured: a name, a cell, and what it does again and again.
+/// A measurement: its name, its cell, and the requests that are repeated.
 type Scenario = (&'static str, fn() -> Cell, [Request; 2]);
 
 fn scenarios() -> [Scenario; 3] {

@@ -1,7 +1,6 @@
-//! Writes down what happens to the cell, [`Line`] by line.
+//! Records the events of the cell, [`Line`] by line.
 //!
-//! A line that cannot be written ends the recording, not the cell. A cell that is started again leaves the recordings of before as they
-//! are.
+//! A line that cannot be written ends the recording, not the cell. A restarted cell does not overwrite earlier recordings.
 
 use crate::core::cell::Cell;
 use crate::core::recording::Line;
@@ -10,19 +9,19 @@ use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-/// Recordings of one name.
+/// Maximum number of recordings with one name.
 const MAX_RECORDINGS: u32 = 1_000;
 
 #[derive(Debug)]
 pub(crate) struct Recorder(Option<BufWriter<File>>);
 
 impl Recorder {
-    /// One that writes nothing.
+    /// A recorder that writes nothing.
     pub(crate) fn none() -> Recorder {
         Recorder(None)
     }
 
-    /// Begins a recording in a new file: `file`, or `file.2`, `file.3` and so on after others.
+    /// Begins a recording in a new file: `file`, or `file.2`, `file.3` and so on if that exists.
     pub(crate) fn begin(file: &Path, cell: &Cell) -> anyhow::Result<Recorder> {
         let (made, file) = new_file(file).with_context(|| format!("cannot record to {}", file.display()))?;
         tracing::info!(file = %file.display(), "what happens is recorded");
@@ -31,7 +30,7 @@ impl Recorder {
         Ok(recorder)
     }
 
-    /// Whether lines are wanted.
+    /// Whether lines are recorded.
     pub(crate) fn is_on(&self) -> bool {
         self.0.is_some()
     }

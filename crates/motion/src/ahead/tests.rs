@@ -1,4 +1,4 @@
-//! What is known ahead is true.
+//! Tests that the results that were computed ahead are correct.
 
 use super::*;
 use crate::ball;
@@ -63,7 +63,7 @@ fn what_is_known_ahead_is_what_a_look_at_each_motion_finds() {
             }
         }
         assert!(touching > 50 && far_away > 10 && free > 10, "{touching}, {far_away}, {free}, {isa:?}");
-        // Nothing was drawn that nobody wanted.
+        // No sample was drawn that was not used.
         assert_eq!(ahead.next(1).sample, plain());
     }
 }

@@ -1,19 +1,19 @@
-//! Robots with several arms: one of them is planned for, and the others stand where they are told to.
+//! Robots with several arms: one of them is planned, and the others stand at given positions.
 //!
-//! A [`Robot`] is seen from one of its arms, which has the number 0; the others have the numbers from 1 on. [`Robot::with_arm`] is the same
-//! robot seen from another arm: that one and the arm 0 change places.
+//! A [`Robot`] is seen from one of its arms, which has the number 0; the others have the numbers from 1 on. [`Robot::with_arm`] is the same robot
+//! seen from another arm: that arm and arm 0 are exchanged.
 
 use super::{Configuration, Joint, Part, Robot, RobotFault, RobotModel};
 use crate::description::{ArmDescription, RobotDescription};
 use crate::joint_vector::JointVector;
 
-/// The most arms that a robot can have.
+/// Maximum number of arms of a robot.
 pub const MAX_ARMS: usize = 4;
 
-/// The posture in which an arm stands unless it is said where.
+/// The default posture of an arm that is not planned.
 const HOME: &str = "home";
 
-/// Where an arm and its fingers are.
+/// The position of an arm and its fingers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ArmPosition {
     /// The arm's joints.
@@ -22,13 +22,13 @@ pub struct ArmPosition {
     pub finger: f64,
 }
 
-/// Where the arms from number 1 on are; an arm without a position is where the robot has it ([`Robot::with_other_arm_at`]).
+/// The positions of the arms from number 1 on; an arm without a position stands at the robot's default ([`Robot::with_other_arm_at`]).
 pub type OtherArms = [Option<ArmPosition>; MAX_ARMS - 1];
 
-/// No position of any of them.
+/// No position for any of them.
 pub const UNSAID: OtherArms = [None; MAX_ARMS - 1];
 
-/// An arm that stands.
+/// An arm that is not planned.
 #[derive(Debug, Clone)]
 pub(super) struct OtherArm {
     name: String,
@@ -37,21 +37,21 @@ pub(super) struct OtherArm {
 }
 
 impl RobotDescription {
-    /// The same with another arm as the one that is planned for.
+    /// The same description with another arm as the planned one.
     pub(super) fn with_arm(&self, name: &str) -> Option<RobotDescription> {
         let mut seen = self.clone();
         let other = seen.other_arms.iter_mut().find(|arm| arm.name == name)?;
         std::mem::swap(&mut seen.arm, other);
         (seen.gripper, other.gripper) = (seen.arm.gripper.take(), seen.gripper);
         (seen.postures, other.postures) = (std::mem::take(&mut seen.arm.postures), seen.postures);
-        // A workplace says what the robot's first arm reaches.
+        // A workplace describes what the robot's first arm reaches.
         seen.workplace = None;
         Some(seen)
     }
 }
 
 impl OtherArm {
-    /// The arms of a description that are not planned for, put where they stand by default.
+    /// The arms of a description that are not planned; puts their default positions into `neutral`.
     pub(super) fn all(
         description: &RobotDescription,
         model: &RobotModel,
@@ -73,7 +73,7 @@ impl OtherArm {
             }
             let finger = other.gripper.as_ref().map(|gripper| Part::gripper(model, gripper)).transpose()?;
             if let Some(finger) = &finger {
-                // Open, they take the most room.
+                // Open fingers take the most room.
                 neutral[finger.indices[0]] = finger.joints[0].upper;
             }
             others.push(OtherArm { name: other.name.clone(), part, finger });
@@ -84,7 +84,7 @@ impl OtherArm {
 }
 
 impl OtherArm {
-    /// Brings its joints to a position.
+    /// Sets the positions of its joints.
     pub(super) fn put(&self, at: &ArmPosition, positions: &mut [f64]) {
         self.part.put(&at.joints, positions);
         if let Some(finger) = &self.finger {
@@ -92,12 +92,12 @@ impl OtherArm {
         }
     }
 
-    /// Its joints, and that of its fingers.
+    /// The parts of its joints and of its fingers.
     pub(super) fn parts(&self) -> [Option<&Part>; 2] {
         [Some(&self.part), self.finger.as_ref()]
     }
 
-    /// How many numbers a position of it has.
+    /// Number of values of its position.
     pub(super) fn values(&self) -> usize {
         self.part.joints.len() + 1
     }
@@ -111,7 +111,7 @@ impl OtherArm {
 }
 
 impl Configuration {
-    /// Brings the joints of an arm to a position. Nothing happens where the arm of that number has none yet.
+    /// Sets the joints of an arm. Does nothing if the arm of that number has no position yet.
     pub fn set_joints(&mut self, arm: usize, joints: JointVector) {
         match arm.checked_sub(1) {
             None => self.arm = joints,
@@ -119,7 +119,7 @@ impl Configuration {
         }
     }
 
-    /// Brings the fingers of an arm to a position, as [`Configuration::set_joints`] does with its joints.
+    /// Sets the fingers of an arm, as [`Configuration::set_joints`] does with its joints.
     pub fn set_finger(&mut self, arm: usize, finger: f64) {
         match arm.checked_sub(1) {
             None => self.finger = finger,
@@ -127,7 +127,7 @@ impl Configuration {
         }
     }
 
-    /// Where an arm is, if that is said.
+    /// The position of an arm, if given.
     pub fn of_arm(&self, arm: usize) -> Option<ArmPosition> {
         match arm.checked_sub(1) {
             None => Some(ArmPosition { joints: self.arm, finger: self.finger }),
@@ -142,7 +142,7 @@ impl Robot {
         std::iter::once(self.arm_name()).chain(self.other_arms())
     }
 
-    /// The limits of the joints of an arm by its number; of an arm that the robot does not have there are none.
+    /// The limits of the joints of the arm with this number; empty if the robot has no such arm.
     pub fn joints_of(&self, arm: usize) -> &[Joint] {
         match arm.checked_sub(1) {
             None => &self.arm.joints,
@@ -150,7 +150,7 @@ impl Robot {
         }
     }
 
-    /// The links that the joints of an arm move, by its number.
+    /// The links that the joints of the arm with this number move.
     pub fn links_of(&self, arm: usize) -> Vec<usize> {
         match arm.checked_sub(1) {
             None => self.arm_links.clone(),
@@ -158,7 +158,7 @@ impl Robot {
         }
     }
 
-    /// The links of the fingers of an arm, by its number.
+    /// The links of the fingers of the arm with this number.
     pub fn finger_links_of(&self, arm: usize) -> Vec<usize> {
         match arm.checked_sub(1) {
             None => self.finger_links(),
@@ -169,7 +169,7 @@ impl Robot {
         }
     }
 
-    /// The same with a position for every arm: one without is where the robot has it.
+    /// The same with a position for every arm: the default for arms without one.
     pub fn with_all_arms(&self, configuration: &Configuration) -> Configuration {
         let mut all = *configuration;
         for (at, arm) in all.others.iter_mut().zip(&self.other_arms) {
@@ -178,7 +178,7 @@ impl Robot {
         all
     }
 
-    /// A configuration of this robot as one of the same robot seen from another arm, by that arm's number here.
+    /// A configuration of this robot, converted to the robot seen from the arm that has this number here.
     pub fn seen_from(&self, arm: usize, configuration: &Configuration) -> Configuration {
         let mut seen = self.with_all_arms(configuration);
         if let Some(other) = arm.checked_sub(1)
@@ -190,20 +190,20 @@ impl Robot {
         seen
     }
 
-    /// The name of the arm that is planned for.
+    /// The name of the planned arm.
     pub fn arm_name(&self) -> &str {
         &self.description.arm.name
     }
 
-    /// The names of the others.
+    /// The names of the other arms.
     pub fn other_arms(&self) -> impl Iterator<Item = &str> {
         self.other_arms.iter().map(|arm| arm.name.as_str())
     }
 
-    /// The same robot with another arm as the one that is planned for.
+    /// The same robot with another planned arm.
     ///
     /// # Errors
-    /// [`RobotFault::NoArm`] where it has none of this name.
+    /// [`RobotFault::NoArm`] if it has no arm with this name.
     pub fn with_arm(&self, name: &str) -> Result<Robot, RobotFault> {
         if name == self.arm_name() {
             return Ok(self.clone());
@@ -214,10 +214,10 @@ impl Robot {
         }
     }
 
-    /// The same robot with one of the other arms standing in a posture.
+    /// The same robot with another default posture of one of the other arms.
     ///
     /// # Errors
-    /// [`RobotFault`] where there is no other arm of this name, or it cannot take the posture.
+    /// [`RobotFault`] if there is no other arm with this name, or it cannot take the posture.
     pub fn with_other_arm_at(mut self, name: &str, posture: &[f64]) -> Result<Robot, RobotFault> {
         let Some(arm) = self.other_arms.iter().find(|arm| arm.name == name) else { return Err(self.no_arm(name)) };
         let posture = arm.part.posture(name, posture)?;

@@ -1,4 +1,4 @@
-//! Whether two robots are the same one: by name, and by a digest of all that moves, collides, reaches and grasps.
+//! The identity of a robot: its name, and a digest of everything that moves, collides, reaches and grasps.
 
 use super::{Geometry, Part, Robot};
 use ratn_model::pose::Pose;
@@ -6,17 +6,17 @@ use ratn_world::digest::Digester;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// How many characters of a digest are shown to people.
+/// Number of characters of a digest in messages.
 const SHOWN: usize = 12;
 
-/// Which robot something is of: a snapshot or a recording of a cell.
+/// The robot to which a snapshot or a recording of a cell belongs.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RobotIdentity {
     /// The robot's name in its description.
     pub name: String,
-    /// A digest of links, shapes, joints with their limits, of which joints are arms, grippers, base and head, and of the names and tools of the
-    /// arms and the hands and fingers of the grippers.
+    /// A digest of links, shapes, joints with their limits, of which joints belong to arms, grippers, base and head, and of the names and tools of
+    /// the arms and the hands and fingers of the grippers.
     pub digest: String,
 }
 
@@ -28,7 +28,7 @@ impl fmt::Display for RobotIdentity {
 }
 
 impl Robot {
-    /// Which robot this is. The same description with the same URDF gives the same identity on every machine.
+    /// The identity of this robot. The same description with the same URDF gives the same identity on every machine.
     pub fn identity(&self) -> RobotIdentity {
         let mut digester = Digester::default();
         let number = |digester: &mut Digester, x: f64| digester.number(x.to_bits());
@@ -44,7 +44,7 @@ impl Robot {
         count(&mut digester, self.model.links.len());
         for link in &self.model.links {
             digester.text(&link.name);
-            // What is not there has a number of its own.
+            // A missing value has its own number.
             count(&mut digester, link.parent.unwrap_or(usize::MAX));
             numbers_of(&link.origin).for_each(|x| number(&mut digester, x));
             match link.drive {
@@ -87,7 +87,7 @@ impl Robot {
             count(&mut digester, indices.len());
             indices.iter().for_each(|index| count(&mut digester, *index));
         }
-        // Which frame is brought to goals, and which link of a gripper is the finger that its pads are found on.
+        // The tool frames, and the link of each gripper that is the finger with its pads.
         for arm in std::iter::once(&self.description.arm).chain(&self.description.other_arms) {
             digester.text(&arm.name);
             digester.text(&arm.tool);

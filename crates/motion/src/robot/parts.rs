@@ -1,7 +1,6 @@
-//! What the joints of a description's parts must be: a finger slides, a head turns, a base is moved along x, along y and about z.
+//! Checks the joints of a description's parts: a finger is prismatic, a head revolute, a base moves along x, along y and about z.
 //!
-//! A joint of another kind would be moved all the same, and everything that is computed of the part would be wrong. So it is refused by its
-//! name.
+//! A joint of another kind would move all the same, and everything computed for the part would be wrong. So it is refused, with its name.
 
 use super::{Part, Robot, RobotFault, RobotModel};
 use crate::description::{BaseDescription, DriveArea, GripperDescription, HeadDescription, RobotDescription};
@@ -9,16 +8,16 @@ use crate::robot_model::{Drive, Joint, poses};
 use ratn_model::pose::Pose;
 use std::f64::consts::TAU;
 
-/// How far an axis or a place may be off, in metres and as a part of a unit vector: rounding.
+/// Tolerance for an axis or a position, in metres and as a part of a unit vector: rounding.
 const ROUNDED: f64 = 1e-6;
-/// Where the base is put to see whether its joints move it there: x, y and heading.
+/// The base pose at which its joints are tested: x, y and heading.
 const ELSEWHERE: [f64; 3] = [1.0, 2.0, 0.5];
 
-/// Least and greatest x and y, and heading where it is limited.
+/// Minimum and maximum x and y, and heading if it is limited.
 type DriveLimits = ([[f64; 2]; 2], Option<[f64; 2]>);
 
 impl RobotDescription {
-    /// No joint is of two parts.
+    /// Checks that no joint belongs to two parts.
     pub(super) fn check_shared(&self) -> Result<(), RobotFault> {
         let gripper = |gripper: &Option<GripperDescription>| gripper.iter().map(|g| g.joint.clone()).collect();
         let mut parts: Vec<(String, Vec<String>)> = Vec::new();
@@ -42,7 +41,7 @@ impl RobotDescription {
 }
 
 impl Part {
-    /// The joint that slides a finger.
+    /// The prismatic joint of a finger.
     pub(super) fn gripper(model: &RobotModel, gripper: &GripperDescription) -> Result<Part, RobotFault> {
         let part = Part::of(model, std::slice::from_ref(&gripper.joint))?;
         let turning = part.drives(model, 0).find(|drive| !drive.slides);
@@ -54,7 +53,7 @@ impl Part {
         Ok(part)
     }
 
-    /// Pan and tilt.
+    /// The joints of pan and tilt.
     pub(super) fn head(model: &RobotModel, head: &HeadDescription) -> Result<Part, RobotFault> {
         let part = Part::of(model, &head.joints)?;
         for (j, joint) in part.joints.iter().enumerate() {
@@ -63,7 +62,7 @@ impl Part {
         Ok(part)
     }
 
-    /// x, y and heading, within the area that it may drive in.
+    /// The joints of x, y and heading, with x and y limited to the area in which it may drive.
     pub(super) fn base(model: &RobotModel, base: &BaseDescription) -> Result<Part, RobotFault> {
         let mut part = Part::of(model, &base.joints)?;
         let expected = [
@@ -91,7 +90,7 @@ impl Part {
         Ok(part)
     }
 
-    /// Where the joints of a base say that it is, its last link is.
+    /// Checks that the pose of the last link is the one that the base's joints give.
     fn check_at_root(&self, model: &RobotModel) -> Result<(), RobotFault> {
         let mut positions = vec![0.0; model.joints.len()];
         for (index, position) in self.indices.iter().zip(ELSEWHERE) {
@@ -110,7 +109,7 @@ impl Part {
         Ok(())
     }
 
-    /// How one of its joints moves links, those that mimic it included.
+    /// The drives of links by one of its joints, including those that mimic it.
     fn drives<'m>(&self, model: &'m RobotModel, joint: usize) -> impl Iterator<Item = Drive> + 'm {
         let index = self.indices[joint];
         model.links.iter().filter_map(|link| link.drive).filter(move |drive| drive.joint == index)
@@ -118,8 +117,7 @@ impl Part {
 }
 
 impl Robot {
-    /// Where the base may drive: least and greatest x, y and heading, in metres and radians. None of a heading where its limits are a whole
-    /// turn apart.
+    /// Where the base may drive: minimum and maximum x, y and heading, in metres and radians. The heading is `None` if its limits are a whole turn apart.
     pub fn drive_area(&self) -> Option<DriveLimits> {
         let [x, y, heading] = self.base_joints() else { return None };
         let limits = |joint: &Joint| [joint.lower, joint.upper];
@@ -128,7 +126,7 @@ impl Robot {
     }
 }
 
-/// Refuses a joint that moves a link so.
+/// Refuses a joint with this drive, if there is one.
 fn refuse(key: &'static str, joint: &Joint, drive: Option<Drive>, expected: &'static str) -> Result<(), RobotFault> {
     let Some(Drive { axis, slides, factor, .. }) = drive else { return Ok(()) };
     let [x, y, z] = axis.map(|c| factor * c);

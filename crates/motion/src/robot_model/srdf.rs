@@ -1,4 +1,4 @@
-//! What an SRDF says of a robot's links: the pairs of them that are not checked against each other.
+//! Reads the SRDF of a robot: the pairs of links that are not checked against each other.
 
 use super::Link;
 use crate::mechanism::MechanismError;
@@ -6,10 +6,10 @@ use crate::xml_text;
 use std::collections::{BTreeMap, BTreeSet};
 use xml::reader::XmlEvent;
 
-/// The pairs of links, the lower index first, that an SRDF excepts from checks.
+/// The pairs of links, lower index first, that an SRDF excepts from collision checks.
 ///
 /// # Errors
-/// [`MechanismError::Srdf`] says where the text is not XML.
+/// [`MechanismError::Srdf`] gives the place where the text is not XML.
 pub(crate) fn excepted(text: &str, links: &[Link]) -> Result<BTreeSet<(usize, usize)>, MechanismError> {
     let index: BTreeMap<&str, usize> = links.iter().enumerate().map(|(i, l)| (l.name.as_str(), i)).collect();
     let mut pairs = BTreeSet::new();
@@ -28,7 +28,7 @@ pub(crate) fn excepted(text: &str, links: &[Link]) -> Result<BTreeSet<(usize, us
             continue;
         }
         let link = |key: &str| attributes.iter().find(|a| a.name.local_name == key).map(|a| a.value.as_str());
-        // An SRDF may speak of links that this variant of the robot does not have.
+        // An SRDF may contain links that this variant of the robot does not have.
         let pair = (link("link1").and_then(|l| index.get(l)), link("link2").and_then(|l| index.get(l)));
         if let (Some(&a), Some(&b)) = pair {
             pairs.insert((a.min(b), a.max(b)));

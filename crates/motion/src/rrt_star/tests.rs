@@ -1,4 +1,4 @@
-//! The tree is one, and its costs are those of its ways.
+//! Tests that the tree is a tree, and that its costs are the lengths of its paths.
 
 use super::*;
 use crate::ball;
@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 
 impl RrtStar {
-    /// Every node hangs on the root, knows its children, and costs what its parent costs and the motion from there.
+    /// Every node is below the root, has the right children, and costs as much as its parent plus the motion from there.
     fn check_invariants(&self) {
         let (mut seen, mut open) = (vec![false; self.nodes.len()], vec![0]);
         while let Some(index) = open.pop() {
@@ -67,7 +67,7 @@ fn costs_are_kept_and_no_circle_comes_about_whatever_is_rewired_evicted_or_taken
         let all = ends();
         let mut best = f32::INFINITY;
         for round in 0..150 {
-            // One more end now and then.
+            // A new end is added from time to time.
             let ends = &all[..(1 + round / 40).min(3)];
             tree.grow(&mut space, ends, 9.0, 5, &mut random, &mut go_on).unwrap();
             if round == 70 {
@@ -98,7 +98,7 @@ fn as_long_as_none_has_to_go_no_node_ever_costs_more_than_before() {
     let mut random = ChaCha8Rng::seed_from_u64(3);
     let mut tree = RrtStar::new(&state(-1.5, -1.5), 2);
     let (mut before, mut turned): (Vec<(f32, usize)>, usize) = (Vec::new(), 0);
-    // Within a post: no way to it bounds what is of interest.
+    // Inside a post: no path reaches it, so none bounds the search.
     let nowhere = [End { state: state(0.6, 0.6), rest: 0.0, rest_s: 0.0 }];
     for _ in 0..200 {
         tree.grow(&mut space, &nowhere, 9.0, 5, &mut random, &mut go_on).unwrap();
