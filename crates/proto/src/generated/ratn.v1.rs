@@ -5934,7 +5934,7 @@ pub struct Goal {
     /// Deadline: the goal is cancelled this long after its arrival, in milliseconds of wall time; 0 for no deadline.
     #[prost(uint64, tag = "8")]
     pub deadline_ms: u64,
-    /// How long the goal goes on without a listener, in milliseconds of wall time, so that its client can reconnect; 0 ends it at once. At most a
+    /// How long the goal may go on without a listener, in milliseconds of wall time, so that its client can reconnect; 0 for not at all. At most a
     /// minute. Its lease may end earlier.
     #[prost(uint64, tag = "9")]
     pub grace_ms: u64,
