@@ -213,7 +213,7 @@ class System:
         parameters: Mapping[str, Any] | None = None,
         **others: Any,
     ) -> Run:
-        """Begins a run of a task, or of a task file. Its parameters are keyword arguments; parameters with the name of an option below go into
+        """Begins a run of a task, or of a task file. Its parameters are keyword arguments; parameters named like an option of this method go into
         ``parameters`` (``parameters={"due": 3}``). ``mode`` is ``cdtn`` or ``hsm``.
 
         It runs beside other runs of the system, unless it or one of them is ``alone``. ``urgency`` (``low``, ``normal``, ``high``) says whose needs
