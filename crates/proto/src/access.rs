@@ -1,51 +1,51 @@
-//! What each method of the wire does, as its option `(access)` in the proto says. Which roles may is for a gate to say.
+//! What each method does, from its option `(access)` in the proto. Which roles may call it is decided elsewhere.
 
-/// What can be done, as far as roles tell it apart.
+/// Operations that roles distinguish.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Operation {
     /// Health and reflection of gRPC; no method of this system.
     Ask,
     /// Listing, watching, querying, explaining.
     Look,
-    /// Opening a session and keeping it alive.
+    /// Opening sessions and keeping them alive.
     Session,
     /// Adding resources to the pool.
     Create,
-    /// Using capacity up.
+    /// Consuming capacity.
     Consume,
     /// Removing resources from the pool.
     Delete,
-    /// Blocking, and taking it back.
+    /// Blocking (leasing), and withdrawing such requests.
     Acquire,
-    /// Giving a lease back.
+    /// Releasing leases.
     Release,
-    /// Making and dropping projections.
+    /// Creating and releasing projections.
     Project,
-    /// Changing the root world.
+    /// Committing changes to the root world.
     Commit,
-    /// Giving goals to providers, and stopping them.
+    /// Giving goals to providers, and cancelling them.
     Perform,
     /// Starting and stopping processes, resetting the cell, letting a robot move again.
     Administer,
-    /// Being asked for what is missing, and saying why there is no more of it.
+    /// Receiving demand for missing resources, and reporting shortages.
     Provide,
 }
 
 /// A method of this system.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Method {
-    /// Its service, `ratn.v1.ResourceService`.
+    /// The name of its service, `ratn.v1.ResourceService`.
     pub service: &'static str,
-    /// Its name, `Create`.
+    /// The name of the method, `Create`.
     pub name: &'static str,
-    /// What it does; nobody may where the proto does not say.
+    /// What it does; without an operation nobody may call it.
     pub operation: Option<Operation>,
 }
 
 /// Every method of every service of the proto.
 pub const METHODS: &[Method] = include!("generated/ratn_v1_methods.rs");
 
-/// The method of a request's path, `/ratn.v1.ResourceService/Create`, if it is one of this system's.
+/// Finds the method with a request's path, `/ratn.v1.ResourceService/Create`.
 pub fn method_of(path: &str) -> Option<&'static Method> {
     let (service, name) = path.strip_prefix('/')?.split_once('/')?;
     METHODS.iter().find(|method| method.service == service && method.name == name)

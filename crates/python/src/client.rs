@@ -344,7 +344,7 @@ impl Lease {
         self.granted.id.0
     }
 
-    /// Grows over all leases: who does the work refuses an older one than it has seen.
+    /// The fencing token, which grows over all leases: a provider refuses tokens that are older than one it has seen.
     #[getter]
     fn token(&self) -> u64 {
         self.granted.token.0
@@ -357,14 +357,14 @@ impl Lease {
         each.map(|held| (held.id.clone(), held.kind.clone(), held.endpoint.clone())).collect()
     }
 
-    /// Whether the session in whose name it is held still lives, as far as is known here. One that the manager has made anew holds nothing of before.
+    /// Whether the session that holds the lease is alive, as far as is known here. A session that the manager has opened again holds nothing from before.
     #[getter]
     fn alive(&self) -> bool {
         let state = *self.held.session.state().borrow();
         state.alive && state.generation == self.generation
     }
 
-    /// Gives the resources back; false where the lease had ended before.
+    /// Releases the resources; false if the lease had ended before.
     fn release(&self, py: Python<'_>) -> PyResult<bool> {
         wait_for(py, &self.runtime, self.held.client.release(self.granted.id))
     }
@@ -384,7 +384,7 @@ impl Lease {
     }
 }
 
-/// A world that might be: that of a revision, with changes. Nobody else sees it.
+/// A projection: a hypothetical world, made of a revision with changes. Nobody else sees it.
 #[pyclass(frozen, module = "ratn")]
 pub(crate) struct Projected {
     base: u64,
@@ -395,20 +395,20 @@ pub(crate) struct Projected {
 
 #[pymethods]
 impl Projected {
-    /// The revision of the world that it stands on.
+    /// The revision of the world that it is based on.
     #[getter]
     fn base(&self) -> u64 {
         self.base
     }
 
-    /// The facts of the projection that match any of the patterns; all of them without one.
+    /// The facts of the projection that match any of the patterns; all facts if no pattern is given.
     #[pyo3(signature = (*patterns))]
     fn query(&self, py: Python<'_>, patterns: Vec<String>) -> PyResult<Vec<Fact>> {
         let patterns = patterns_of(&patterns)?;
         Ok(Fact::all(wait_for(py, &self.lease.runtime, self.world.query(Some(self.id), &patterns))?))
     }
 
-    /// Ends it, and gives its room back; false where it had ended before.
+    /// Ends the projection and releases its resource; false if it had ended before.
     fn release(&self, py: Python<'_>) -> PyResult<bool> {
         let released = wait_for(py, &self.lease.runtime, self.world.release(self.id));
         self.lease.release(py)?;
@@ -429,7 +429,7 @@ impl Projected {
     }
 }
 
-/// What holds, then each revision of the root world, as dicts with `revision`, `written` (facts) and `gone` (texts).
+/// The present facts, then each revision of the root world, as dicts with `revision`, `written` (facts) and `gone` (strings).
 #[pyclass(frozen, module = "ratn")]
 pub(crate) struct WorldWatch {
     runtime: Arc<OwnRuntime>,

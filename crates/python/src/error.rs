@@ -9,29 +9,29 @@ use ratn_worker::client::CallError;
 use std::error::Error as StdError;
 use std::iter::successors;
 
-create_exception!(_ratn, Error, PyException, "What went wrong with a system; the base of the others.");
-create_exception!(_ratn, Unavailable, Error, "Nobody answered: a process is gone, or a connection broke.");
-create_exception!(_ratn, Malformed, Error, "An answer that means nothing.");
-create_exception!(_ratn, Refused, Error, "The one who was asked said no; the base of the gRPC codes below.");
-create_exception!(_ratn, NotFound, Refused, "There is no such thing (NOT_FOUND).");
-create_exception!(_ratn, AlreadyExists, Refused, "It is another's, or was asked for otherwise (ALREADY_EXISTS).");
-create_exception!(_ratn, InvalidArgument, Refused, "What was asked for makes no sense (INVALID_ARGUMENT).");
-create_exception!(_ratn, FailedPrecondition, Refused, "It cannot be as things are (FAILED_PRECONDITION).");
+create_exception!(_ratn, Error, PyException, "A failure of a system; the base class of the other exceptions.");
+create_exception!(_ratn, Unavailable, Error, "No answer: a process has ended, or a connection broke.");
+create_exception!(_ratn, Malformed, Error, "An answer that is not valid.");
+create_exception!(_ratn, Refused, Error, "The server refused; the base class of the gRPC codes below.");
+create_exception!(_ratn, NotFound, Refused, "What was requested does not exist (NOT_FOUND).");
+create_exception!(_ratn, AlreadyExists, Refused, "It is another's, or was requested differently (ALREADY_EXISTS).");
+create_exception!(_ratn, InvalidArgument, Refused, "The request is not valid (INVALID_ARGUMENT).");
+create_exception!(_ratn, FailedPrecondition, Refused, "The present state does not allow it (FAILED_PRECONDITION).");
 create_exception!(_ratn, PermissionDenied, Refused, "The caller's roles do not allow it (PERMISSION_DENIED).");
-create_exception!(_ratn, ResourceExhausted, Refused, "There is no more of it (RESOURCE_EXHAUSTED).");
-create_exception!(_ratn, DeadlineExceeded, Refused, "It did not come in time (DEADLINE_EXCEEDED).");
-create_exception!(_ratn, OutOfRange, Refused, "A number is beyond what there is (OUT_OF_RANGE).");
-create_exception!(_ratn, Unauthenticated, Refused, "Nobody knows who asks (UNAUTHENTICATED).");
-create_exception!(_ratn, Unimplemented, Refused, "The server does not have that (UNIMPLEMENTED).");
-create_exception!(_ratn, InvalidTask, Error, "A task file that is refused; `findings` says what is wrong where.");
-create_exception!(_ratn, Cancelled, Error, "The goal shall stop: let it through, after putting things in order.");
+create_exception!(_ratn, ResourceExhausted, Refused, "A limit is reached (RESOURCE_EXHAUSTED).");
+create_exception!(_ratn, DeadlineExceeded, Refused, "The deadline passed (DEADLINE_EXCEEDED).");
+create_exception!(_ratn, OutOfRange, Refused, "A number is outside of the available range (OUT_OF_RANGE).");
+create_exception!(_ratn, Unauthenticated, Refused, "The caller is not identified (UNAUTHENTICATED).");
+create_exception!(_ratn, Unimplemented, Refused, "The server does not have this method (UNIMPLEMENTED).");
+create_exception!(_ratn, InvalidTask, Error, "A task file that is not valid; `findings` lists the problems.");
+create_exception!(_ratn, Cancelled, Error, "The goal was cancelled: clean up, and let the exception through.");
 create_exception!(
     _ratn,
     Aborted,
     Error,
     "Raised by an action: the goal's outcome is `aborted`, with this as the reason."
 );
-create_exception!(_ratn, Lost, Error, "The world that the goal works on is gone; another attempt may have more luck.");
+create_exception!(_ratn, Lost, Error, "The goal's world does not exist any more; another attempt may succeed.");
 
 /// Adds the exceptions to the module.
 pub(crate) fn add_to(py: Python<'_>, module: &Bound<'_, PyModule>) -> PyResult<()> {

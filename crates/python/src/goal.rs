@@ -20,7 +20,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use tokio::runtime::Handle;
 use tokio::task::AbortHandle;
 
-/// A goal under way: what is to be done, and what may be done with it.
+/// A goal under way: its inputs, and the means to perform it.
 #[pyclass(frozen, module = "ratn")]
 pub(crate) struct Goal {
     context: Arc<GoalContext>,
@@ -71,36 +71,36 @@ impl Goal {
 
 #[pymethods]
 impl Goal {
-    /// Unique to the attempt.
+    /// The id of the attempt, unique.
     #[getter]
     fn id(&self) -> &str {
         &self.context.id
     }
 
-    /// The action's name.
+    /// The name of the action.
     #[getter]
     fn action(&self) -> &str {
         &self.context.action
     }
 
-    /// What every random choice is to be derived from.
+    /// The seed for every random choice.
     #[getter]
     fn seed(&self) -> u64 {
         self.context.seed
     }
 
-    /// Whether the goal shall stop.
+    /// Whether the goal has been cancelled.
     #[getter]
     fn cancelled(&self) -> PyResult<bool> {
         Ok(self.here()?.cancelled.is_cancelled())
     }
 
-    /// Goes on unless the goal shall stop: then it raises `ratn.Cancelled`. Often enough is ten times a second.
+    /// Raises `ratn.Cancelled` if the goal has been cancelled. Calling it ten times a second is often enough.
     fn checkpoint(&self) -> PyResult<()> {
         self.here()?.checkpoint().map_err(of_failure)
     }
 
-    /// Waits so many seconds of wall time; raises `ratn.Cancelled` as soon as the goal shall stop.
+    /// Sleeps for `seconds` of wall time; raises `ratn.Cancelled` as soon as the goal is cancelled.
     fn sleep(&self, py: Python<'_>, seconds: f64) -> PyResult<()> {
         let (goal, pause) = (self.here()?, patience("seconds", Some(seconds))?);
         let slept = async {
@@ -112,8 +112,8 @@ impl Goal {
         py.detach(|| self.runtime.block_on(slept)).map_err(of_failure)
     }
 
-    /// Waits while a hold is in force at the driver, or the goal is suspended; raises `ratn.Cancelled` as soon as the goal shall stop. What
-    /// moves something calls it between two steps.
+    /// Waits while the driver is held or the goal is suspended; raises `ratn.Cancelled` as soon as the goal is cancelled. Actions that move something
+    /// call it between two steps.
     fn while_held(&self, py: Python<'_>) -> PyResult<()> {
         let goal = self.here()?;
         py.detach(|| self.runtime.block_on(goal.while_held())).map_err(of_failure)
@@ -130,8 +130,8 @@ impl Goal {
         Ok(Fact::all(facts.map_err(of_world)?))
     }
 
-    /// Says how far it is, to whoever listens and to the event log; figures as keyword arguments. The message and the figures have at most 16 KiB together
-    /// (`ValueError`); what comes more than 100 times a second is not told.
+    /// Reports progress to listeners and to the event log; figures are keyword arguments. Message and figures have at most 16 KiB together
+    /// (`ValueError`); calls above 100 per second are dropped.
     #[pyo3(signature = (message, /, **figures))]
     fn progress(&self, message: String, figures: Option<&Bound<'_, PyDict>>) -> PyResult<()> {
         let goal = self.here()?;
@@ -147,23 +147,23 @@ impl Goal {
         Ok(())
     }
 
-    /// The outputs that stay as they were in the first result, where the goal may give one and go on for better ones (`goal.improved`); `None`
-    /// where only what the action returns counts.
+    /// The outputs that must keep the values of the first result, if the goal allows intermediate results (`goal.improved`); `None` if only the
+    /// returned result counts.
     #[getter]
     fn improves(&self) -> Option<Vec<String>> {
         self.context.improves().map(<[String]>::to_vec)
     }
 
-    /// Gives a result that can be used, and goes on: the first one, or one that costs less than those before. `cost_s` is what it costs
-    /// whoever uses it, in seconds of the robot's time. The goal is told to stop (`ratn.Cancelled`) when somebody uses the result, or wants the worker:
-    /// then the last one that was given counts.
+    /// Gives an intermediate result that can be used, and goes on: the first one, or one with a lower cost than those before. `cost_s` is the cost of
+    /// using it, in seconds of the robot's time. The goal is cancelled (`ratn.Cancelled`) when somebody uses the result, or needs the worker: then
+    /// the last given result counts.
     #[pyo3(signature = (outputs, *, cost_s))]
     fn improved(&self, outputs: &Bound<'_, PyDict>, cost_s: f64) -> PyResult<()> {
         self.here()?.improved(fields_from_python(outputs)?, cost_s).map_err(of_failure)
     }
 
-    /// A fact as measured, `goal.measured("at(box_1)", pose, covariance=…)`: it is told with the outcome. `covariance` is a square matrix,
-    /// row by row or as an array (of a pose x, y, z in metres, and the rotation about them in radians); `confidence` is a probability.
+    /// Records a measured fact, `goal.measured("at(box_1)", pose, covariance=…)`, which is sent with the outcome. `covariance` is a square matrix,
+    /// row by row or as an array (for a pose x, y, z in metres, and the rotations about them in radians); `confidence` is a probability.
     #[pyo3(signature = (fact_text, value, *, covariance=None, confidence=None, source=String::new()))]
     fn measured(
         &self,
@@ -188,7 +188,7 @@ impl Goal {
         Ok(())
     }
 
-    /// Has another provider of this goal's lease do something, `goal.call("Camera", "capture", exposure_s=0.01)`; its outputs.
+    /// Has another provider of this goal's lease perform an action, `goal.call("Camera", "capture", exposure_s=0.01)`; returns its outputs.
     #[pyo3(signature = (kind, action, /, **inputs))]
     fn call<'py>(
         &self,
@@ -207,7 +207,7 @@ impl Goal {
         fields_to_python(py, called.map_err(|error| of_failure(failure(error)))?)
     }
 
-    /// Calls `back` without arguments, in another thread, when the goal shall stop. After the goal's end it is not called any more.
+    /// Calls `back` without arguments, in another thread, when the goal is cancelled; not after the goal's end.
     fn on_cancel(&self, back: Py<PyAny>) -> PyResult<()> {
         let cancelled = self.here()?.cancelled.clone();
         let mut watching = self.watching.lock().unwrap_or_else(PoisonError::into_inner);

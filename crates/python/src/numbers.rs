@@ -65,8 +65,7 @@ enum Memory {
     Bytes(Arc<Vec<u8>>),
 }
 
-/// Numbers that came from a system: a row of them, or a matrix as its rows. `numpy.asarray(numbers)` is a view of them without a copy, which cannot
-/// be written to.
+/// Numbers from a system: a row, or a matrix as its rows. `numpy.asarray(numbers)` is a read-only view without a copy.
 #[pyclass(frozen, sequence, module = "ratn")]
 #[derive(Debug)]
 pub(crate) struct Numbers {
@@ -134,7 +133,7 @@ impl Numbers {
 
 #[pymethods]
 impl Numbers {
-    /// How many there are; of a matrix the rows and the columns.
+    /// The number of elements; for a matrix the numbers of rows and columns.
     #[getter]
     fn shape<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
         PyTuple::new(py, &self.shape)

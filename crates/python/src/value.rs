@@ -26,7 +26,7 @@ const MAX_DEPTH: usize = 32;
 /// A quaternion whose length differs from 1 by less than this counts as normalised.
 const UNIT: f64 = 1e-12;
 
-/// A rigid pose: a position in metres, and an orientation as a unit quaternion (x, y, z, w).
+/// A rigid pose: a position in metres and an orientation as a unit quaternion (x, y, z, w).
 #[pyclass(frozen, from_py_object, module = "ratn")]
 #[derive(Clone, Debug)]
 pub(crate) struct Pose(pub(crate) pose::Pose);
@@ -66,24 +66,24 @@ impl Pose {
         self.0.position[2]
     }
 
-    /// Metres.
+    /// The position in metres.
     #[getter]
     fn position(&self) -> (f64, f64, f64) {
         self.0.position.into()
     }
 
-    /// x, y, z, w.
+    /// The quaternion x, y, z, w.
     #[getter]
     fn quaternion(&self) -> (f64, f64, f64, f64) {
         self.0.quaternion_xyzw.into()
     }
 
-    /// Metres between the positions.
+    /// The distance between the positions in metres.
     fn distance(&self, other: &Pose) -> f64 {
         self.0.distance(&other.0)
     }
 
-    /// Radians between the orientations.
+    /// The angle between the orientations in radians.
     fn angle(&self, other: &Pose) -> f64 {
         self.0.angle(&other.0)
     }
@@ -93,12 +93,12 @@ impl Pose {
         Pose(self.0.compose(&other.0))
     }
 
-    /// The pose of the reference, as seen from this one.
+    /// The inverse pose: the reference frame in this frame.
     fn inverse(&self) -> Pose {
         Pose(self.0.inverse())
     }
 
-    /// The point, given as seen from this pose, as seen from where this pose is given.
+    /// Transforms a point from this pose's frame to the reference frame.
     fn transform(&self, point: [f64; 3]) -> (f64, f64, f64) {
         self.0.transform(point).into()
     }
@@ -126,7 +126,7 @@ impl Pose {
     }
 }
 
-/// Positions of a robot's joints: radians, metres for sliding ones, in the robot's order. `numpy.asarray(joints)` is a view without a copy.
+/// Positions of a robot's joints: radians, metres for prismatic ones, in the robot's order. `numpy.asarray(joints)` is a view without a copy.
 #[pyclass(frozen, sequence, module = "ratn")]
 #[derive(Debug)]
 pub(crate) struct Joints(Floats);
@@ -175,7 +175,7 @@ impl Joints {
     }
 }
 
-/// A timed path of joints: names, and points of seconds, positions (radians) and velocities (radians per second).
+/// A timed path in joint space: joint names, and points of seconds, positions (radians) and velocities (radians per second).
 #[pyclass(frozen, module = "ratn")]
 #[derive(Debug)]
 pub(crate) struct Trajectory {
@@ -292,33 +292,33 @@ impl Trajectory {
         self.value.joints.clone()
     }
 
-    /// `(time_s, positions, velocities)` each.
+    /// A tuple `(time_s, positions, velocities)` for each point.
     #[getter]
     fn points(&self) -> Vec<Point> {
         let point = |point: &TrajectoryPoint| (point.time_s, point.positions.clone(), point.velocities.clone());
         self.value.points.iter().map(point).collect()
     }
 
-    /// Seconds from the start of the motion, of each point. numpy looks at them without a copy.
+    /// Seconds from the start of the motion for each point. numpy can use them without a copy.
     #[getter]
     fn times_s(&self) -> Numbers {
         Numbers::row(self.columns().times_s.clone())
     }
 
-    /// Radians (metres for sliding joints): a row for each point, a column for each joint. numpy looks at them without a copy.
+    /// Radians (metres for prismatic joints): one row per point, one column per joint. numpy can use them without a copy.
     #[getter]
     fn positions(&self) -> Numbers {
         Numbers::matrix(self.columns().positions.clone(), self.value.joints.len())
     }
 
-    /// Radians (metres) per second, as the positions; `None` where a point has none.
+    /// Radians (metres) per second, arranged like the positions; `None` if a point has none.
     #[getter]
     fn velocities(&self) -> Option<Numbers> {
         let velocities = self.columns().velocities.clone()?;
         Some(Numbers::matrix(velocities, self.value.joints.len()))
     }
 
-    /// Seconds from the first to the last point.
+    /// Seconds from the first point to the last.
     #[getter]
     fn duration_s(&self) -> f64 {
         self.value.duration_s()
@@ -373,7 +373,7 @@ impl Fact {
         &self.record.key.predicate
     }
 
-    /// Its arguments, in order.
+    /// The arguments, in order.
     #[getter]
     fn key<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
         let terms = self.record.key.arguments.iter().map(|term| match term {
@@ -388,26 +388,26 @@ impl Fact {
         Ok(self.value.get_or_try_init(py, || self.made(py))?.clone_ref(py))
     }
 
-    /// The revision of the world with which it was written.
+    /// The revision of the world that wrote it.
     #[getter]
     fn revision(&self) -> u64 {
         self.record.revision.0
     }
 
-    /// What measured it; nothing where it was not measured.
+    /// The source of the measurement; `None` if the fact was not measured.
     #[getter]
     fn source(&self) -> Option<String> {
         self.record.measured.as_ref().map(|measured| measured.source.clone())
     }
 
-    /// The covariance of its numbers, where its source said so: a square matrix, at which numpy looks without a copy.
+    /// The covariance of its numbers, if its source gave one: a square matrix that numpy can use without a copy.
     #[getter]
     fn covariance(&self) -> Option<Numbers> {
         let is_told = !covariance(&self.record).is_empty();
         is_told.then(|| Numbers::square(Floats::Of(Arc::clone(&self.record), covariance)))
     }
 
-    /// The probability that it is so, where its source said so.
+    /// The probability that it is true, if its source gave one.
     #[getter]
     fn confidence(&self) -> Option<f64> {
         match self.record.measured.as_ref()?.certainty.as_ref()? {

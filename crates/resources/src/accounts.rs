@@ -1,25 +1,25 @@
-//! Accounts: how much each session has had of each family of kinds, for its share, beside those who wait with it.
+//! Accounts for fair sharing: how much each session has used of each family of kinds, relative to its share and to the sessions that wait.
 //!
 //! ```text
-//!   while a session holds some:      service += time × units / its share
-//!   ahead of those who wait there:   (service - least of theirs) × sum of the shares / units that they hold, as time
-//!   when it begins to hold or wait:  service ≥ level: an idle session saves nothing up
-//!   when its turn begins:            service within AHEAD of the least of theirs: what is beyond is forgotten, either way
+//!   while a session holds units:     service += time × units / its share
+//!   ahead of those who wait there:   (service - least of theirs) × sum of the shares / units held by them, as time
+//!   when it begins to hold or wait:  service ≥ level: idle sessions accumulate no credit
+//!   when its turn begins:            service within AHEAD of the least of theirs: any larger difference is forgotten, in both directions
 //! ```
 //!
-//! Those who wait are the sessions that need something for certain which what exists would do for; the level is the least that they had when
-//! one of them last began a turn. Who holds and does not wait, who waits for what does not exist, and how much there is that nobody waits
-//! for, make no difference to others. What is held counts, not what it was needed for; what is consumed does not. Not written down: after a
-//! restart everybody begins anew.
+//! "Those who wait" are the sessions that need something for certain which the existing resources could satisfy; the level is the least service that
+//! they had when one of them last began a turn. Sessions that hold and do not wait, sessions that wait for what does not exist, and capacity that
+//! nobody waits for, make no difference to others. Held units count, whatever they were needed for; consumed units do not. Accounts are not
+//! persistent: after a restart every session begins anew.
 //!
-//! Nothing happens by itself: an account is settled when its session gets or gives back. To compare takes a look at each session there, once
-//! for all that are compared at a moment.
+//! Nothing happens by itself: an account is settled when its session gets or releases something. A comparison reads each session once, for all that
+//! are compared at that time.
 //!
-//! The shares of a caller's sessions that hold or wait count as its bound together where they are more (`share_per_caller`): as if each were so
-//! many times smaller, time for time. What such a caller's session owes is then as many times longer at the most, and goes to the next session of
-//! the caller where it ends, so that nobody has more by opening sessions.
+//! If the shares of a caller's sessions that hold or wait exceed a bound in total (`share_per_caller`), they count as this bound together: each share
+//! is scaled down by the same factor, and time is scaled with it. What such a session owes is then at most that factor longer, and passes to the
+//! caller's next session when the session ends, so that nobody gets more by opening sessions.
 //!
-//! From: start-time fair queueing (Goyal, Vin, Cheng 1996), with a bound on how far apart accounts are.
+//! Source: start-time fair queueing (Goyal, Vin, Cheng 1996), with a bound on the difference between accounts.
 
 use crate::id::{SessionId, WaiterId};
 use crate::own_order::{Families, OwnOrder, OwnPlace, Settled};
@@ -30,11 +30,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Nanoseconds, times units, for a share of 1.
+/// Nanoseconds times units, at a share of 1.
 type Service = u128;
 
-/// So much of what ended sessions had is kept for each caller and family, the most of it: more sessions than a caller usually may have
-/// (`sessions_per_caller`).
+/// Maximum number of ended sessions' services that are kept for each caller and family, the largest ones: more than the sessions that a caller
+/// usually may have (`sessions_per_caller`).
 const MOST_LEFT: usize = 4_096;
 
 /// See the module.
@@ -42,16 +42,16 @@ const MOST_LEFT: usize = 4_096;
 pub(crate) struct Accounts {
     families: BTreeMap<Arc<str>, FamilyAccounts>,
     sessions: BTreeMap<SessionId, OfSession>,
-    /// Those of whom it is to be found out which of their requests are first ones.
+    /// Sessions whose first requests have to be determined anew.
     unsettled: BTreeSet<SessionId>,
-    /// At so many accounts and requests was looked.
+    /// Number of accounts and requests that were read.
     looked_at: usize,
 }
 
-/// What a session has in all families together.
+/// A session's data for all families.
 #[derive(Debug, Clone, Default)]
 struct OfSession {
-    /// In which families it has an account.
+    /// The families in which it has an account.
     families: Families,
     order: OwnOrder,
 }
@@ -60,74 +60,74 @@ struct OfSession {
 struct FamilyAccounts {
     level: Service,
     accounts: BTreeMap<SessionId, Account>,
-    /// So many of them hold or wait.
+    /// The number of accounts that hold or wait.
     active: usize,
-    /// Those who need something for certain at a moment, as long as nothing of it has changed.
+    /// The sessions that need something for certain at some time, while they are unchanged.
     rivals: Option<(Timestamp, Rivals)>,
-    /// Those whose sessions have a bound together and hold or wait.
+    /// The callers with a bound on their shares whose sessions hold or wait.
     callers: BTreeMap<Arc<str>, OfCaller>,
 }
 
-/// What the sessions of a caller are together.
+/// The sessions of one caller together.
 #[derive(Debug, Clone, Default)]
 struct OfCaller {
     /// The sum of the shares of those that hold or wait, in thousandths.
     shares: u64,
     beyond: Beyond,
-    /// What sessions had that have ended while the shares were beyond the bound, the most last; [`MOST_LEFT`] at the most.
+    /// The services of sessions that ended while the shares exceeded the bound, in ascending order; at most [`MOST_LEFT`].
     left: Vec<Service>,
 }
 
-/// How far shares are beyond their bound: as many times as `shares` is `bound`, which is never less than once.
+/// The factor by which shares exceed their bound, `shares / bound`; at least 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Beyond {
     shares: u64,
     bound: u64,
 }
 
-/// What a session has and had of a family.
+/// The account of a session in a family.
 #[derive(Debug, Clone, Default)]
 struct Account {
     service: Service,
-    /// The service counts what was held until then.
+    /// The time up to which the service counts held units.
     settled: Timestamp,
     held: Quantity,
     share: Share,
-    /// Whose it is, and what of its share is in the sum of that caller, in thousandths.
+    /// The caller who opened the session, and the part of its share that counts in that caller's sum, in thousandths.
     caller: Arc<str>,
     counted: u64,
     beyond: Beyond,
-    /// Its requests that wait and for which what exists would do.
+    /// Its waiting requests that existing resources could satisfy.
     waiting: BTreeSet<OwnPlace>,
-    /// When the last one was served that was the first of them.
+    /// When a request was last served that was the first of these.
     served: Timestamp,
 }
 
-/// Who does something in a family.
+/// The session that acts in a family.
 #[derive(Debug, Clone)]
 pub(crate) struct Within<'a> {
     pub(crate) session: &'a SessionId,
     pub(crate) family: &'a str,
     pub(crate) share: Share,
-    /// Who opened the session.
+    /// The caller who opened the session.
     pub(crate) caller: &'a Arc<str>,
-    /// What the shares of all sessions of that caller are together at the most, in thousandths; none where it has no bound.
+    /// The bound on the total share of that caller's sessions, in thousandths; `None` for no bound.
     pub(crate) bound: Option<u64>,
     pub(crate) now: Timestamp,
 }
 
-/// Those who need something of a family for certain, at a moment.
+/// The sessions that need something of a family for certain, at some time.
 #[derive(Debug, Clone, Default)]
 struct Rivals {
-    /// The two that have had the least.
+    /// The two sessions with the least service.
     least: [Option<(Service, SessionId)>; 2],
     /// The sum of their shares, in thousandths.
     shares: u128,
-    /// What they hold, in thousandths.
+    /// The units that they hold, in thousandths.
     held: u128,
 }
 
-/// What one of them is beside the others.
+/// One of these sessions.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 struct Rival {
     service: Service,
@@ -135,14 +135,14 @@ struct Rival {
     held: u128,
 }
 
-/// How one session stands beside its rivals.
+/// A session compared with its rivals.
 struct Beside {
     service: Service,
-    /// The least that another one has had; nothing where there is none.
+    /// The least service of another one; `None` if there is no other.
     least: Option<Service>,
-    /// With its own.
+    /// Including its own share.
     shares: u128,
-    /// The same, one unit at the least.
+    /// Including its own units; at least one unit.
     held: u128,
     beyond: Beyond,
 }
@@ -165,19 +165,19 @@ impl Beyond {
         self != Beyond::default()
     }
 
-    /// So many times as much.
+    /// The amount multiplied by this factor.
     fn more(self, amount: u128) -> u128 {
         amount.saturating_mul(self.shares.into()) / u128::from(self.bound)
     }
 
-    /// So many times less, as a share: never nothing.
+    /// The share divided by this factor; never zero.
     fn less(self, share: Share) -> u128 {
         (u128::from(share.thousandths()) * u128::from(self.bound) / u128::from(self.shares)).max(1)
     }
 }
 
 impl OfCaller {
-    /// A session has ended that had so much.
+    /// Keeps the service of a session that has ended.
     fn keep(&mut self, service: Service) {
         let at = self.left.partition_point(|less| *less <= service);
         self.left.insert(at, service);
@@ -192,19 +192,19 @@ impl Account {
         !self.held.is_zero() || !self.waiting.is_empty()
     }
 
-    /// Whether it needs something for certain. What is certain is first.
+    /// Whether it needs something for certain. Certain requests are ordered first.
     fn needs_some(&self) -> bool {
         self.waiting.first().is_some_and(|(speculative, ..)| !speculative)
     }
 
     fn service_at(&self, now: Timestamp) -> Service {
         let passed = u128::from(now.0.saturating_sub(self.settled.0));
-        // Below 2^64 × 2^42, and thousandths by thousandths.
+        // Below 2^64 × 2^42; the thousandths cancel.
         let cost = passed * u128::from(self.held.thousandths()) / u128::from(self.share.thousandths());
         self.service.saturating_add(self.beyond.more(cost))
     }
 
-    /// Nothing where it needs nothing for certain.
+    /// `None` if it needs nothing for certain.
     fn as_rival(&self, now: Timestamp) -> Option<Rival> {
         let (share, held) = (self.beyond.less(self.share), self.held.thousandths().into());
         self.needs_some().then(|| Rival { service: self.service_at(now), share, held })
@@ -217,7 +217,7 @@ impl Account {
 }
 
 impl Beside {
-    /// By how much it is ahead, as time for all of them together.
+    /// How far the session is ahead, as time for all of them together.
     fn ahead(&self) -> Duration {
         let Some(least) = self.least else { return Duration::ZERO };
         let nanoseconds = self.service.saturating_sub(least).saturating_mul(self.shares) / self.held;
@@ -225,14 +225,14 @@ impl Beside {
         Duration::from_nanos(u64::try_from(nanoseconds.min(most)).unwrap_or(u64::MAX))
     }
 
-    /// The service that is [`AHEAD`] long.
+    /// The service that corresponds to [`AHEAD`].
     fn most(&self) -> Service {
         AHEAD.as_nanos() * self.held / self.shares.max(1)
     }
 }
 
 impl FamilyAccounts {
-    /// Finds the rivals of a moment, unless they are known; at how many accounts was looked for that.
+    /// Determines the rivals at some time, unless known; returns the number of accounts read.
     fn find_rivals(&mut self, now: Timestamp) -> usize {
         if self.rivals.as_ref().is_some_and(|(at, _)| *at == now) {
             return 0;
@@ -252,7 +252,7 @@ impl FamilyAccounts {
         self.accounts.len()
     }
 
-    /// One of them is another one at a moment. Where that leaves those who have had the least, the others need no look.
+    /// Updates the rivals when one of them changes. If those with the least service stay known, the other accounts need not be read.
     fn rival_changes(&mut self, session: &SessionId, now: Timestamp, before: Option<Rival>, after: Option<Rival>) {
         if before == after {
             return;
@@ -287,8 +287,8 @@ impl FamilyAccounts {
         Beside { service, least: others.map(|(service, _)| *service), shares, held: held.max(one), beyond }
     }
 
-    /// What is counted of an account for its caller is another amount, and may put all accounts of that caller further beyond their bound, or
-    /// less far; at how many accounts was looked for that.
+    /// Updates the amount that an account contributes to its caller's sum, which may change the factor for all accounts of that caller; returns the
+    /// number of accounts read.
     fn count(&mut self, within: &Within<'_>, before: u64, after: u64) -> usize {
         if before == after {
             return 0;
@@ -314,13 +314,13 @@ impl FamilyAccounts {
 }
 
 impl Accounts {
-    /// By how much a session is ahead of its rivals in a family, as time; [`AHEAD`] at the most, and as many times that as the shares of
-    /// its caller are beyond their bound.
+    /// How far a session is ahead of its rivals in a family, as time; at most [`AHEAD`] times the factor by which the shares of its caller exceed
+    /// their bound.
     pub(crate) fn ahead(&mut self, within: &Within<'_>) -> Duration {
         self.beside(within).map_or(Duration::ZERO, |beside| beside.ahead())
     }
 
-    /// A turn of a session begins: what it had is no further from what others had than [`AHEAD`].
+    /// Begins a turn of a session: limits its service to within [`AHEAD`] of the services of others.
     pub(crate) fn begins_turn(&mut self, within: &Within<'_>) {
         let Some(beside) = self.beside(within) else { return };
         let Some(family) = self.families.get_mut(within.family) else { return };
@@ -345,26 +345,26 @@ impl Accounts {
         Some(family.beside(rivals, within))
     }
 
-    /// At how many accounts and requests was looked since this was asked last.
+    /// Returns and resets the number of accounts and requests that were read.
     pub(crate) fn take_looks(&mut self) -> usize {
         std::mem::take(&mut self.looked_at)
     }
 
-    /// A request of a session that takes something of these families waits from now on, as [`Accounts::waits`] has said of each.
+    /// A request that takes units of these families begins to wait; [`Accounts::waits`] has been called for each family.
     pub(crate) fn joins(&mut self, session: &SessionId, families: Families, own: OwnPlace) {
         if !families.is_empty() && self.sessions.entry(session.clone()).or_default().order.insert(families, own) {
             self.unsettled.insert(session.clone());
         }
     }
 
-    /// The same of one that does not any more. To be said before [`Accounts::waits_no_more`].
+    /// The reverse of `joins`. To be called before [`Accounts::waits_no_more`].
     pub(crate) fn parts(&mut self, session: &SessionId, families: &Families, own: &OwnPlace) {
         if self.sessions.get_mut(session).is_some_and(|of| of.order.remove(families, own)) {
             self.unsettled.insert(session.clone());
         }
     }
 
-    /// How the first requests of a session are others since requests of it have come and gone; nothing where that is settled for all.
+    /// How the first requests of one session have changed since requests of it came and went; `None` if all sessions are settled.
     pub(crate) fn settle_next(&mut self) -> Option<Settled> {
         let session = self.unsettled.pop_first()?;
         let settled = self.sessions.get_mut(&session).map(|of| of.order.settle()).unwrap_or_default();
@@ -372,7 +372,7 @@ impl Accounts {
         Some(settled)
     }
 
-    /// Whether a request of a session that takes something of these families is a first one, or would be.
+    /// Whether a request of a session that takes units of these families is a first one, or would be.
     pub(crate) fn is_first<'a>(
         &self,
         session: &SessionId,
@@ -388,7 +388,7 @@ impl Accounts {
         sessions.filter_map(|session| self.sessions.get(session)?.order.first_of(family)).collect()
     }
 
-    /// When the last request of a session was served that was its first in a family.
+    /// When a request of a session was last served that was its first in a family.
     pub(crate) fn served(&self, session: &SessionId, family: &str) -> Timestamp {
         self.account(session, family).map_or(Timestamp(0), |account| account.served)
     }
@@ -397,14 +397,14 @@ impl Accounts {
         self.families.get(family)?.accounts.get(session)
     }
 
-    /// A request of it waits from now on.
+    /// A request of the session begins to wait.
     pub(crate) fn waits(&mut self, within: &Within<'_>, own: OwnPlace) {
         self.change(within, |account| {
             account.waiting.insert(own);
         });
     }
 
-    /// A request of it does not any more; it was served, as its first, or was not.
+    /// A request of the session no longer waits; `served` if it was served as the first.
     pub(crate) fn waits_no_more(&mut self, within: &Within<'_>, own: OwnPlace, served: bool) {
         self.change(within, |account| {
             account.waiting.remove(&own);
@@ -414,24 +414,24 @@ impl Accounts {
         });
     }
 
-    /// It holds so much more.
+    /// The session holds this amount more.
     pub(crate) fn holds(&mut self, within: &Within<'_>, amount: Quantity) {
         self.change(within, |account| account.held += amount);
     }
 
-    /// It holds so much less.
+    /// The session holds this amount less.
     pub(crate) fn holds_no_more(&mut self, within: &Within<'_>, amount: Quantity) {
         self.change(within, |account| account.held = account.held.saturating_sub(amount));
     }
 
-    /// It has another share from now on, in every family, or its caller another bound.
+    /// The session has another share from now on, in every family, or its caller another bound.
     pub(crate) fn has_share(&mut self, within: &Within<'_>) {
         for family in self.sessions.get(within.session).map(|of| of.families.clone()).unwrap_or_default() {
             self.change(&Within { family: &family, ..within.clone() }, |_| {});
         }
     }
 
-    /// Nothing of a session is left.
+    /// Removes everything of a session.
     pub(crate) fn forget(&mut self, session: &SessionId) {
         for name in self.sessions.remove(session).unwrap_or_default().families {
             let Some(family) = self.families.get_mut(&name) else { continue };
@@ -491,7 +491,7 @@ impl Accounts {
         if service > level {
             return;
         }
-        // It is where anybody begins.
+        // A new account would begin with the same service.
         family.accounts.remove(*session);
         if family.accounts.is_empty() {
             self.families.remove(&name);
@@ -504,7 +504,7 @@ impl Accounts {
         }
     }
 
-    /// Whether each account has what its session holds and waits for.
+    /// Whether the accounts match what their sessions hold and wait for.
     pub(crate) fn agree(&self, has: &BTreeMap<(SessionId, Arc<str>), (Quantity, usize)>) -> Result<(), String> {
         let mut active = 0;
         for (name, family) in &self.families {
@@ -595,9 +595,9 @@ mod tests {
         let mut bench = Bench::new([1.0, 3.0, 100.0]);
         bench.when(10, 1, |accounts, within| accounts.waits(within, own(1)));
         bench.when(10, 0, |accounts, within| accounts.holds(within, Quantity::ONE));
-        // 5 s of one unit for a share of 1, of 4 in all.
+        // 5 s of one unit at a share of 1, of 4 in total.
         assert_eq!((bench.ahead(15, 0), bench.ahead(15, 1)), (20, 0));
-        // Another share, and who merely holds or waits for what may not be needed, make no difference.
+        // Another share, or a session that only holds, or waits speculatively, makes no difference.
         bench.when(15, 2, |accounts, within| accounts.holds(within, Quantity::whole(7)));
         bench.when(15, 2, |accounts, within| accounts.waits(within, (true, Reverse(0), WaiterId(2))));
         assert_eq!((bench.ahead(15, 0), bench.ahead(15, 1)), (20, 0));
@@ -612,10 +612,10 @@ mod tests {
         bench.when(0, 0, |accounts, within| accounts.holds(within, Quantity::ONE));
         bench.when(1_000, 0, |accounts, within| accounts.waits(within, own(1)));
         bench.when(1_000, 0, |accounts, within| accounts.begins_turn(within));
-        // The other one comes when the first has had it for long: they begin alike.
+        // The other session comes when the first has long held the unit: they begin equally.
         bench.when(1_000, 1, |accounts, within| accounts.waits(within, own(2)));
         assert_eq!((bench.ahead(1_000, 0), bench.ahead(1_000, 1)), (0, 0));
-        // After another 500 s with it, the first owes 60 s at the most.
+        // After another 500 s with the unit, the first owes at most 60 s.
         bench.when(1_500, 0, |accounts, within| accounts.begins_turn(within));
         bench.when(1_500, 0, |accounts, within| accounts.holds_no_more(within, Quantity::ONE));
         bench.when(1_500, 1, |accounts, within| accounts.holds(within, Quantity::ONE));
@@ -681,7 +681,7 @@ mod tests {
             accounts.forget(&session);
         }
         let left = &accounts.families["Arm"].callers["adam"].left;
-        // Three of them count as a third each.
+        // With three sessions, each counts as a third.
         let least = 3 * at(ROUNDS + 1 - MOST_LEFT as u64).0;
         assert_eq!((left.len(), left[0] / 1_000), (MOST_LEFT, Service::from(least) / 1_000));
         assert!(left.is_sorted());
@@ -707,7 +707,7 @@ mod tests {
         assert_eq!(counted(&pool), None, "an operator has no bound");
         says(&mut pool, false);
         assert_eq!(counted(&pool), Some(2_000));
-        // As after a restart: nobody has pinged yet.
+        // As after a restart: no session has pinged yet.
         pool.sessions.values_mut().for_each(|session| session.for_anybody = None);
         pool.open_accounts();
         assert_eq!(counted(&pool), Some(2_000));
@@ -723,7 +723,7 @@ mod tests {
         bench.when(0, 0, |accounts, within| accounts.holds(within, Quantity::ONE));
         bench.shares[0] = Share::new(3.0).unwrap();
         bench.when(4, 0, |accounts, within| accounts.has_share(within));
-        // 4 s at a share of 1, then 3 s at 3, of 4 in all.
+        // 4 s at a share of 1, then 3 s at 3, of 4 in total.
         assert_eq!(bench.ahead(7, 0), 20);
     }
 }

@@ -1,7 +1,7 @@
-//! The only place where what is durable changes: an effect is applied, when it happens as when its record is read back.
+//! The only place where durable state changes: an effect is applied both when it happens and when its record is read back.
 //!
-//! [`Pool::commit`] applies and writes down; restoring applies alone. So what is restored cannot differ from what was.
-//! Each effect also tells the watchers, which makes the revision a function of the records.
+//! [`Pool::commit`] applies an effect and records it; restoring only applies it, so the restored state cannot differ. Each effect also notifies the
+//! watchers, which makes the revision a function of the records.
 
 use crate::accounts::{Accounts, Within};
 use crate::event::EndReason;
@@ -24,18 +24,18 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// An effect that does not fit the pool: a record was lost, or is not of this pool.
+/// An effect that does not fit the pool: a record was lost, or belongs to another pool.
 pub(crate) type Misfit = String;
 
 impl Pool {
-    /// Makes a change and writes it down.
+    /// Applies an effect and records it.
     pub(crate) fn commit(&mut self, effect: Effect) {
         let applied = self.apply(&effect);
         debug_assert_eq!(applied, Ok(()), "the pool made an effect that does not fit it: {effect:?}");
         self.records.push(Record(effect));
     }
 
-    /// Makes a change.
+    /// Applies an effect.
     pub(crate) fn apply(&mut self, effect: &Effect) -> Result<(), Misfit> {
         match effect {
             Effect::SessionKept { session, client, ttl } => {
@@ -253,7 +253,7 @@ impl Pool {
         self.memory.remember(id, fingerprint, reply.clone(), life, self.now);
     }
 
-    /// What a session has consumed of these returns, and no undone grant returns it again.
+    /// Returns what a session has consumed of these resources, so that undoing a grant does not return it again.
     fn end_consumption(&mut self, session: &SessionId, slots: BTreeSet<Slot>) -> Result<(), Misfit> {
         let of_session = |lease: &&LeaseId| self.leases.get(*lease).is_some_and(|known| known.session == *session);
         let undoable = slots.iter().filter_map(|slot| self.undoable.get(slot)).flatten();
@@ -307,7 +307,7 @@ impl Pool {
         Ok(())
     }
 
-    /// Keeps the units of a lease that ends taken, if the resource's provider has to confirm standstill; whether it has.
+    /// Keeps the units of an ending lease taken if the resource's provider has to confirm standstill; returns whether it has to.
     fn begin_standstill(&mut self, lease: LeaseId, record: &LeaseRecord, slot: Slot, reason: EndReason) -> bool {
         let standstill = self.resources.get(slot).map_or(Duration::ZERO, |resource| resource.description.standstill());
         if reason.is_the_holders() || standstill.is_zero() {
@@ -329,7 +329,7 @@ impl Pool {
         true
     }
 
-    /// Nothing is left of a lease at a resource; whether something was.
+    /// Frees what an ended lease has left of a resource; returns whether there was anything.
     fn end_standstill(&mut self, lease: LeaseId, slot: Slot) -> bool {
         let Some(ending) = self.ending.get_mut(&lease) else { return false };
         let Some(Bound(until)) = ending.slots.remove(&slot) else { return false };
@@ -341,7 +341,7 @@ impl Pool {
         true
     }
 
-    /// Puts what a lease holds, or has held, to the account of its session.
+    /// Adds what a lease holds, or has held, to the account of its session.
     fn count_held(
         &mut self,
         session: &SessionId,
@@ -367,7 +367,7 @@ impl Pool {
         Ok(())
     }
 
-    /// A session with no time to live ends.
+    /// A session whose time to live is zero is ending.
     pub(crate) fn start_session_timer(&mut self, session: &SessionId, expires: Timestamp) {
         if self.sessions.get(session).is_some_and(|known| known.ending.is_some()) {
             self.resources.close(session);
@@ -394,7 +394,7 @@ impl Pool {
         }
     }
 
-    /// Changes a resource, and tells the queue.
+    /// Changes a resource, and notifies the queue.
     fn change<T>(&mut self, slot: Slot, change: impl FnOnce(&mut Resource) -> T) -> Option<T> {
         if self.queue.families.is_empty() {
             return self.resources.change(slot, change);
@@ -437,7 +437,7 @@ fn missing(slot: Slot) -> Misfit {
     format!("{slot} is empty")
 }
 
-/// How much of a resource a lease has under it, in its order; adjacent amounts of one resource together.
+/// Adds an amount to the list of what a lease has taken, in order; adjacent amounts of one resource are merged.
 pub(crate) fn join(held: &mut Vec<(Slot, Quantity)>, slot: Slot, amount: Quantity) {
     match held.last_mut() {
         Some((last, sum)) if *last == slot => *sum += amount,

@@ -1,5 +1,5 @@
-//! Use of the pool by each caller: how many sessions it opened, what those provide and hold, how many of their acquires wait, and for
-//! how many selectors. Counted beside the sessions, which say whose they are; kept nowhere. Whether one may have more: [`Share`].
+//! Use of the pool by each caller: the numbers of sessions, of resources provided, of leases, of waiting acquires and of their selectors. Derived
+//! from the sessions, which name their callers; not stored. [`Share`] checks whether a caller may have more.
 
 use crate::error::{ALL, ALL_BUT_OPERATORS, PoolError};
 use crate::group::Key;
@@ -9,7 +9,7 @@ use crate::session::{Session, Sessions};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// By the name that the connection proves.
+/// By the caller's name, which the connection proves.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Callers(BTreeMap<Arc<str>, Has>);
 
@@ -17,28 +17,28 @@ pub(crate) struct Callers(BTreeMap<Arc<str>, Has>);
 struct Has {
     sessions: usize,
     resources: usize,
-    /// Those included that have ended while a provider has not confirmed standstill.
+    /// Including leases that have ended but whose providers have not confirmed standstill.
     leases: usize,
     waiters: usize,
-    /// How many requirements of its waiters select what.
+    /// For each selector, the number of requirements of the caller's waiters.
     selectors: BTreeMap<Key, usize>,
 }
 
-/// Of something that has a bound, what there is, and what may be.
+/// The use of something limited, and its limits.
 pub(crate) struct Share {
     pub(crate) what: &'static str,
     pub(crate) there: usize,
-    /// The name of the bound in all, and the bound.
+    /// The name and the value of the limit in total.
     pub(crate) limit: (&'static str, usize),
-    /// The name of what of it is kept for operators, and how many these are.
+    /// The name and the value of the part that is reserved for operators.
     pub(crate) for_operators: (&'static str, usize),
     pub(crate) of_caller: usize,
-    /// The name of this bound, and the bound.
+    /// The name and the value of the limit per caller.
     pub(crate) quota: (&'static str, usize),
 }
 
 impl Share {
-    /// Whether there may be so many more for a session.
+    /// Whether a session may have this many more.
     pub(crate) fn check(&self, more: usize, session: &Session) -> Result<(), PoolError> {
         let Share { what, there, limit: (key, limit), for_operators, of_caller, quota: (quota, most) } = *self;
         if there + more > limit {
@@ -59,13 +59,13 @@ impl Share {
     }
 }
 
-/// What of a bound is for everybody: at least half of it.
+/// The part of a limit that is for everybody: at least half of it.
 pub(crate) fn for_all(limit: usize, for_operators: usize) -> usize {
     limit - for_operators.min(limit / 2)
 }
 
 impl Callers {
-    /// As the sessions, leases that end and waiters say.
+    /// Counts the sessions, ending leases and waiters.
     pub(crate) fn of(sessions: &Sessions, ending: &EndingLeases, queue: &Queue) -> Callers {
         let mut callers = Callers::default();
         for session in sessions.values() {
@@ -101,12 +101,12 @@ impl Callers {
         self.0.get(caller).map_or(0, |has| has.selectors.len())
     }
 
-    /// What each caller waits for, by selector.
+    /// The selectors that each caller waits for.
     pub(crate) fn waited_for(&self) -> impl Iterator<Item = impl Iterator<Item = &Key>> {
         self.0.values().map(|has| has.selectors.keys())
     }
 
-    /// How many of these a caller does not wait for yet.
+    /// How many of these selectors a caller does not wait for yet.
     pub(crate) fn new_selectors(&self, caller: &str, groups: &[Key]) -> usize {
         let mut groups: Vec<&Key> = groups.iter().collect();
         groups.sort_unstable();

@@ -1,12 +1,11 @@
-//! Changes of resources, and which waiting requests they may help.
+//! Changes of resources, and the waiting requests that they may help.
 //!
-//! Each group of a family knows how much exists for it and what of that is free. A change of a resource concerns every group that
-//! the resource fits, and a family may have thousands of groups. So a change is only noted; turns settle what was noted: a few
-//! resources of one family with all groups of the family at a time, as far as a turn's share goes, the families in turn. A family
-//! of which something is noted is not shared out, and nobody in it is served, until that is settled.
+//! Each group of a family knows how much exists for it and how much of that is free. A change of a resource affects every group that the resource
+//! fits, and a family may have thousands of groups. So a change is only noted; turns settle the notes: a few resources of one family for all groups
+//! of the family at a time, within the turn's work limit, and family by family. While a family has notes, its resources are not shared out, and no
+//! waiter of it is served.
 //!
-//! Not noted is what a grant takes: nobody gains by that, and a group finds out itself that a resource has nothing left
-//! ([`Group::exhausted`]).
+//! What a grant takes is not noted: no group gains by it, and a group itself finds out that a resource has nothing left ([`Group::exhausted`]).
 
 use crate::group::{Family, Group, Seen};
 use crate::id::{Slot, WaiterId};
@@ -19,20 +18,20 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Bound;
 use std::sync::Arc;
 
-/// Resources that changed, by family; with what the family's groups know of each, nothing where that is none of the family.
+/// The changed resources by family, each as the family's groups know it; `None` if it was not of the family.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Touched {
     families: BTreeMap<Arc<str>, BTreeMap<Slot, Option<Seen>>>,
-    /// The family that was settled last: the one behind it is next.
+    /// The family that was settled last; the one after it is next.
     settled: Option<Arc<str>>,
 }
 
-/// A resource, and what groups know of it.
+/// A resource, and what the groups know about it.
 type Noted = (Slot, Option<Seen>);
-/// The same, and what it is now.
+/// The same, with its present state.
 type Change = (Slot, Option<Seen>, Option<Seen>);
 
-/// Behind every place.
+/// After every place.
 const LAST: Place = (Turn::LAST, WaiterId(u64::MAX));
 
 impl Touched {
@@ -44,12 +43,12 @@ impl Touched {
         self.families.contains_key(family)
     }
 
-    /// A family is gone.
+    /// The family no longer exists.
     pub(crate) fn forget(&mut self, family: &str) {
         self.families.remove(family);
     }
 
-    /// A new group knows what the others of its family know.
+    /// Gives a new group the same knowledge as the others of its family.
     pub(crate) fn as_before(&self, resources: &Resources, group: &mut Group) {
         for (slot, before) in self.families.get(&group.family).into_iter().flatten() {
             let now = resources.get(*slot).map(Seen::of);
@@ -58,7 +57,7 @@ impl Touched {
         }
     }
 
-    /// Some resources of the next family, so many at the most that they take `work` with its groups, and one at the least.
+    /// Takes some resources of the next family: as many as cost at most `work` for all its groups, and at least one.
     fn next(&mut self, families: &BTreeMap<Arc<str>, Family>, work: usize) -> Option<(Arc<str>, Vec<Noted>)> {
         let behind = self.settled.as_ref().map_or(Bound::Unbounded, Bound::Excluded);
         let mut next = self.families.range::<Arc<str>, _>((behind, Bound::Unbounded));
@@ -75,7 +74,7 @@ impl Touched {
     }
 }
 
-/// What a change of one resource is for one group: what of it fits, before and after.
+/// The effect of one changed resource on one group: what fits of it, before and after.
 #[derive(Clone, Copy)]
 struct Step {
     free: (Quantity, Quantity),
@@ -119,7 +118,7 @@ impl Queue {
         let same =
             matches!((before, after), (Some(one), Some(other)) if Arc::ptr_eq(&one.description, &other.description));
         let (free_before, free) = (before.map_or(Quantity::ZERO, |b| b.free), after.map_or(Quantity::ZERO, |a| a.free));
-        // Who has reserved it may have to do with something else.
+        // Waiters that have reserved this resource may have to use something else.
         if reserved > free || (!same && !reserved.is_zero()) {
             self.changed.insert(name.clone(), true);
         }
@@ -131,7 +130,7 @@ impl Queue {
 }
 
 impl Pool {
-    /// Tells the groups of one family of some of the resources that changed; false where nothing is left to tell.
+    /// Tells the groups of one family about some of its changed resources; false if there is nothing left.
     pub(crate) fn settle(&mut self) -> bool {
         let queue = &mut self.queue;
         let Some((name, slots)) = queue.touched.next(&queue.families, self.enough / 8) else { return false };
@@ -156,14 +155,14 @@ impl Pool {
     }
 }
 
-/// What groups found when they were told of changes.
+/// The effect on the groups that were told of changes.
 #[derive(Default)]
 struct Told {
-    /// Something that fits one of them has more free.
+    /// More is free of something that fits one of them.
     more_is_free: bool,
     /// There is more or less of something that fits one of them.
     other: bool,
-    /// Who may be hopeful now and was not, or the other way.
+    /// Waiters that may become hopeful, or stop being hopeful.
     concerned: BTreeSet<Place>,
 }
 
@@ -188,7 +187,7 @@ impl Told {
             return;
         }
         self.other = true;
-        // For those with several requirements in the family, and where there are parts of units, it is not enough to count.
+        // For waiters with several requirements in the family, and with fractions of units, counting is not enough.
         self.concerned.extend(&group.several);
         if parts {
             self.concerned.extend(group.by_amount.iter().map(|(_, place)| *place));
@@ -196,7 +195,7 @@ impl Told {
         }
         let (low, high) = (was.min(group.existing), was.max(group.existing));
         let between = group.by_amount.range((Bound::Excluded((low, LAST)), Bound::Included((high, LAST))));
-        // More makes hopeful who is not, and less the other way.
+        // An increase makes waiters hopeful, a decrease makes them hopeless.
         let hopeful = was > group.existing;
         let matters = |place: &Place| waiters.get(&place.1).is_some_and(|waiter| waiter.hopeful == hopeful);
         self.concerned.extend(between.map(|(_, place)| *place).filter(matters));
@@ -204,7 +203,7 @@ impl Told {
 }
 
 impl Pool {
-    /// Whether groups know what there is, where nothing is to be told.
+    /// Whether the groups without notes know the true amounts.
     pub(crate) fn groups_agree(&self) -> Result<(), String> {
         for group in self.queue.groups.values().filter(|group| !self.queue.touched.is_in(&group.family)) {
             if !group.knows(&self.resources) {

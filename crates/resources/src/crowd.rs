@@ -1,9 +1,8 @@
-//! The holders of a resource, as views show them: in parts that views share.
+//! The holders of a resource, as views show them: in parts that the views share.
 //!
-//! Every event of a lease carries views of its resources. With a copy of all holders in each, the end of thousands of leases of one
-//! resource would cost their square in time and memory. A resource with many holders therefore keeps them in parts; a change makes
-//! one part anew, and a view takes all parts without copying them. They are made of leases and of what ended leases have left, and
-//! hold nothing that is not there.
+//! Every event of a lease contains views of its resources. If each view copied all holders, the end of thousands of leases of one resource would cost
+//! quadratic time and memory. A resource with many holders therefore keeps them in parts; a change replaces one part, and a view shares all parts
+//! without copying. The parts are derived from the leases and from what ended leases have left, and contain nothing else.
 
 use crate::id::Slot;
 use crate::pool::Pool;
@@ -14,24 +13,24 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Holders in one part at the most. A resource with no more of them keeps no parts.
+/// Maximum number of holders in one part. A resource with fewer holders keeps no parts.
 const PART: usize = 64;
 
-/// Of every resource with more than [`PART`] holders.
+/// The crowds of all resources with more than [`PART`] holders.
 pub(crate) type Crowds = BTreeMap<Slot, Crowd>;
 
-/// The holders of one resource, in the order of leases; no part is empty.
+/// The holders of one resource, ordered by lease; no part is empty.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Crowd(Vec<Arc<[Holder]>>);
 
 #[derive(Debug, Clone, PartialEq)]
 enum Holder {
     Lives(Holding),
-    /// Its lease has ended; its units are free after the time at the latest.
+    /// Its lease has ended; its units are free at this time at the latest.
     Ends(EndingUnits, Timestamp),
 }
 
-/// Who has units of a resource at a moment, in the order of leases.
+/// The holders of a resource at some time, ordered by lease.
 #[derive(Debug, Clone, Default)]
 pub struct Holders {
     crowd: Crowd,
@@ -39,7 +38,7 @@ pub struct Holders {
 }
 
 impl Holders {
-    /// Live leases.
+    /// Holdings of live leases.
     pub fn live(&self) -> impl Iterator<Item = &Holding> {
         self.crowd.iter().filter_map(|holder| match holder {
             Holder::Lives(holding) => Some(holding),
@@ -47,7 +46,7 @@ impl Holders {
         })
     }
 
-    /// Leases that have ended, while something may still move for them.
+    /// Units of leases that have ended, while something may still move for them.
     pub fn ending(&self) -> impl Iterator<Item = EndingUnits> {
         self.crowd.iter().filter_map(|holder| match holder {
             Holder::Lives(_) => None,
@@ -79,7 +78,7 @@ impl Crowd {
         self.0.iter().flat_map(|part| part.iter())
     }
 
-    /// Makes anew the part in which a lease is, or is to be; without a holder it is not there any more.
+    /// Replaces the part in which a lease is or belongs; without a holder the lease is removed.
     fn set(&mut self, lease: LeaseId, holder: Option<Holder>) {
         let at = self.0.partition_point(|part| part.first().is_some_and(|first| first.lease() <= lease));
         let at = at.saturating_sub(1);
@@ -89,7 +88,7 @@ impl Crowd {
             part.insert(part.partition_point(|other| other.lease() < lease), holder);
         }
         let mut end = at + 1;
-        // So that many small parts do not remain where many holders were.
+        // So that the parts do not stay small when most holders have left.
         if let Some(next) = self.0.get(end).filter(|next| part.len() + next.len() <= PART / 2) {
             part.extend(next.iter().cloned());
             end += 1;
@@ -108,7 +107,7 @@ impl Pool {
         Holders { crowd, at: self.now }
     }
 
-    /// A lease holds or has left something else of a resource than before.
+    /// What a lease holds, or has left, of a resource has changed.
     pub(crate) fn held_otherwise(&mut self, slot: Slot, lease: LeaseId) {
         let Some(resource) = self.resources.get(slot).filter(|resource| resource.holders.len() > PART) else {
             self.crowds.remove(&slot);
@@ -126,13 +125,13 @@ impl Pool {
         }
     }
 
-    /// After everything was filled in.
+    /// Builds all crowds, after a pool was restored.
     pub(crate) fn gather_crowds(&mut self) {
         let large = self.resources.iter().filter(|(_, resource)| resource.holders.len() > PART);
         self.crowds = large.map(|(slot, resource)| (slot, self.crowd(slot, resource))).collect();
     }
 
-    /// Whether the parts say what the leases say.
+    /// Whether the parts match the leases.
     pub(crate) fn crowds_agree(&self) -> bool {
         let large = self.resources.iter().filter(|(_, resource)| resource.holders.len() > PART).count();
         self.crowds.len() == large
@@ -167,7 +166,7 @@ mod tests {
 
     const NOW: Timestamp = Timestamp(0);
 
-    /// A tool that three hundred leases hold.
+    /// A tool held by three hundred leases.
     fn crowded(spec: ResourceSpec) -> Pool {
         let mut pool = Pool::default();
         pool.set_limits(crate::Limits::default());

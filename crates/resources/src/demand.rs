@@ -1,8 +1,8 @@
-//! Demand: resources that requests wait for and that do not exist yet, or are held for long (`growth.rs`), for the providers that could
-//! create them; and why a provider does not.
+//! Demand: resources that requests wait for and that do not exist yet, or have been held for long (`growth.rs`); it is reported to the providers that
+//! could create them. Also the reasons why a provider does not.
 //!
-//! Demand is of now: it goes when its waiters do, or when what they want is there. It is not written down, nor is what providers
-//! say of it; both are said again after a restart.
+//! Demand describes the present: it ends with its waiters, or when what they want exists. Neither demand nor the providers' reasons are persistent;
+//! both are reported again after a restart.
 
 use crate::error::{PoolError, malformed};
 use crate::group::{Group, Key};
@@ -15,33 +15,33 @@ use ratn_model::time::Timestamp;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Selectors that providers are told of: those who wait for others come up when what these lack is there. Callers have them in turn.
+/// Maximum number of selectors reported to providers: others follow when what these lack exists. Callers take turns.
 const SELECTORS: usize = 256;
-/// Bytes of what they ask for that providers are told of.
+/// Maximum size of the reported selectors.
 const DEMAND_BYTES: usize = 1 << 20;
-/// Waiters of one selector that are looked at where it is not enough to count, the most urgent ones.
+/// Maximum number of waiters examined per selector if counting is not enough; the most urgent ones.
 const LOOKED_AT: usize = 64;
-/// Kinds of which one session may say that it cannot provide them.
+/// Maximum number of kinds that one session may report as unavailable.
 const SHORTAGES: usize = 64;
-/// Characters of a reason; the rest is cut off.
+/// Maximum number of characters of a reason; longer ones are cut.
 const REASON_LENGTH: usize = 512;
 
-/// The most urgent one that waits for a selector, what is missing of that, and what is queued for.
+/// The most urgent waiter of a selector, the selector, the missing amount, and the queued amount.
 type Lacking<'a> = (Place, &'a Key, Quantity, Quantity);
 
-/// What one selector lacks.
+/// The demand for one selector.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Demand {
-    /// What is selected; its count is how much is missing beside those that exist, which may be nothing.
+    /// The selector; its count is the missing amount in addition to what exists, which may be zero.
     pub requirement: Requirement,
-    /// How much has been waited for for long although what exists would do.
+    /// The amount that requests have long waited for although existing resources would satisfy them.
     pub queued: Quantity,
-    /// The kinds that would do: its kind, and those below.
+    /// The kinds that would satisfy it: its kind and the subclasses.
     pub kinds: Vec<String>,
 }
 
 impl Pool {
-    /// What is missing now of what these kinds would do for, where that may be something else than at the last call.
+    /// The missing resources that these kinds would satisfy, if this may have changed since the last call.
     pub fn take_demand(&mut self, provided: &Arc<Provided>) -> Option<Vec<Demand>> {
         if !Arc::ptr_eq(&self.queue.provided, provided) && self.queue.provided != *provided {
             self.queue.provided = Arc::clone(provided);
@@ -59,7 +59,7 @@ impl Pool {
         let (mut told, mut missing, mut bytes) = (BTreeSet::new(), Vec::new(), 0);
         while missing.len() < SELECTORS && bytes < DEMAND_BYTES && !turns.is_empty() {
             turns.retain_mut(|selectors| {
-                // Of several callers who lack the same, one has had their turn for it.
+                // If several callers lack the same, only the first of them uses a turn for it.
                 let next = selectors.find(|(_, key, ..)| told.insert(Key::clone(key)));
                 let Some((_, key, missing_here, queued_here)) = next.filter(|_| missing.len() < SELECTORS) else {
                     return false;
@@ -72,8 +72,7 @@ impl Pool {
         Some(missing)
     }
 
-    /// Which of these selectors lack something that is provided, how much, and how much is queued for; as many as are told of, the most
-    /// urgent first.
+    /// The selectors that lack something provided, with the missing and the queued amounts; at most as many as are reported, the most urgent first.
     fn lacking<'a>(&'a self, selectors: impl Iterator<Item = &'a Key>, queued: &Queued) -> Vec<Lacking<'a>> {
         let kinds = self.resources.kinds();
         let lacking = selectors.filter_map(|key| {
@@ -96,7 +95,7 @@ impl Pool {
         lacking
     }
 
-    /// How much more there would have to be for the waiter of a group that lacks most.
+    /// How much more would have to exist for the waiter of a group that lacks most.
     fn missing(&self, key: &Key, group: &Group) -> Quantity {
         let counts = |(_, place): &&(Quantity, Place)| !group.several.contains(place);
         let counted =
@@ -113,8 +112,8 @@ impl Pool {
         Demand { requirement: Requirement { count: missing, ..group.selector.clone() }, queued, kinds }
     }
 
-    /// A provider says why there are no more of a kind, to those who wait for it; an empty reason takes that back. It goes with the
-    /// session.
+    /// A provider reports why there are no more resources of a kind, for those who wait for it; an empty reason withdraws the report. It ends with
+    /// the session.
     ///
     /// # Errors
     /// An unknown session, a malformed kind, too many kinds.
@@ -142,7 +141,7 @@ impl Pool {
         Ok(())
     }
 
-    /// Why there are no more of what a requirement wants, in the words of the providers.
+    /// Why there are no more of what a requirement wants, as reported by the providers.
     pub(crate) fn shortages_of(&self, requirement: &Requirement) -> Vec<String> {
         let kinds = self.resources.kinds();
         let of_session = |(session, shortages): (&SessionId, &BTreeMap<String, String>)| {

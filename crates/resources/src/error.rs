@@ -1,143 +1,143 @@
-//! Why the pool does not do what a request asks.
+//! Why the pool refuses a request.
 
 use crate::id::{SessionId, WaiterId};
 use ratn_model::id::LeaseId;
 use ratn_model::resource::Quantity;
 use std::sync::Arc;
 
-/// A refused request; the pool is as it was before.
+/// A refused request; the pool is unchanged.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PoolError {
     /// The session was never opened, has expired or was closed.
     #[error("{session} is unknown or has expired: send a keep-alive to open it anew")]
     UnknownSession {
-        /// Which.
+        /// The session.
         session: SessionId,
     },
-    /// The session has ended, and not everything that hung on it is gone yet.
+    /// The session has ended, but not everything that belongs to it has been removed.
     #[error("{session} is ending: try again in a moment")]
     SessionEnding {
-        /// Which.
+        /// The session.
         session: SessionId,
     },
-    /// No such lease, or it has ended.
+    /// There is no such lease, or it has ended.
     #[error("{lease} is unknown or has ended")]
     UnknownLease {
-        /// Which.
+        /// The lease.
         lease: LeaseId,
     },
-    /// No such waiter, or it has been answered.
+    /// There is no such waiter, or it has been answered.
     #[error("{waiter} is not in the queue")]
     UnknownWaiter {
-        /// Which.
+        /// The waiter.
         waiter: WaiterId,
     },
-    /// No such resource.
+    /// There is no such resource.
     #[error("there is no resource `{id}`")]
     UnknownResource {
-        /// Which.
+        /// The id of the resource.
         id: String,
     },
-    /// A resource of that id is there and belongs to another session.
+    /// A resource with that id exists and belongs to another session.
     #[error("resource `{id}` exists already and belongs to {owner}")]
     ResourceTaken {
-        /// Which.
+        /// The id of the resource.
         id: String,
-        /// Whose: a session, or nobody's.
+        /// The owner: a session, or nobody.
         owner: String,
     },
-    /// The lease or session is not the caller's.
+    /// The lease or session does not belong to the caller.
     #[error("{what} belongs to {owner}, not to {caller}")]
     NotYours {
-        /// What.
+        /// The lease or session.
         what: String,
-        /// Whose it is.
+        /// The owner.
         owner: SessionId,
-        /// Who asked.
+        /// The caller's session.
         caller: SessionId,
     },
-    /// Somebody speaks for a session that another opened.
+    /// The caller uses a session that another caller opened.
     #[error("session `{}` belongs to {}, not to {speaker}", session.as_str(), owner_of(opened_by))]
     SessionOfAnother {
-        /// Which.
+        /// The session.
         session: SessionId,
-        /// Who opened it; empty where nobody knows.
+        /// The caller who opened it; empty if unknown.
         opened_by: Arc<str>,
-        /// Who spoke.
+        /// The caller.
         speaker: Arc<str>,
     },
-    /// Somebody speaks for a session that has ended, whose id is kept for who opened it.
+    /// The caller uses the id of an ended session, which is kept for the caller who opened it.
     #[error(
         "session `{}` has ended, and its id is kept for {opened_by}, who opened it: {speaker} has to open a session with another id",
         session.as_str()
     )]
     SessionIdKept {
-        /// Which.
+        /// The session.
         session: SessionId,
-        /// For whom.
+        /// The caller for whom the id is kept.
         opened_by: Arc<str>,
-        /// Who spoke.
+        /// The caller.
         speaker: Arc<str>,
     },
-    /// Fewer resources match than the operation takes.
+    /// Fewer resources match than the operation needs.
     #[error("{wanted} wanted, but {found} units of it are free")]
     NotEnough {
-        /// What was asked.
+        /// What was requested.
         wanted: String,
-        /// How much there is.
+        /// How much is free.
         found: Quantity,
     },
     /// A request that no pool could perform.
     #[error("{what}: {rule}")]
     Malformed {
-        /// What is wrong, as written.
+        /// The wrong part of the request.
         what: String,
-        /// The rule that it breaks.
+        /// The rule that it violates.
         rule: String,
     },
-    /// A bound of [`crate::Limits`] is reached.
+    /// A limit of [`crate::Limits`] is reached.
     #[error("{what} of {whose}: the limit of {limit} is reached (limits.{key}): try again later")]
     TooMany {
-        /// Of what.
+        /// What is limited.
         what: &'static str,
-        /// Of whom together.
+        /// The callers to whom the limit applies together.
         whose: &'static str,
-        /// Which, of [`crate::Limits`].
+        /// The name of the limit in [`crate::Limits`].
         key: &'static str,
-        /// The bound.
+        /// The value of the limit.
         limit: usize,
     },
-    /// What one caller may have is reached.
+    /// The quota of one caller is reached.
     #[error("{what} of {whose}: the quota of {limit} is reached (limits.{quota}): end some first")]
     Quota {
-        /// Of what.
+        /// What is limited.
         what: &'static str,
-        /// Whose.
+        /// The caller.
         whose: Arc<str>,
-        /// Which, of [`crate::Limits`].
+        /// The name of the quota in [`crate::Limits`].
         quota: &'static str,
-        /// The bound.
+        /// The value of the quota.
         limit: usize,
     },
-    /// An acquire whose request id was withdrawn before it arrived.
+    /// The request id of an acquire was withdrawn before the acquire arrived.
     #[error("request id `{id}` was withdrawn before its acquire arrived: to acquire anew, ask with another one")]
     Withdrawn {
-        /// Which.
+        /// The request id.
         id: String,
     },
-    /// A request id that was used for something else before.
+    /// The request id was used for another request before.
     #[error("request id `{id}` was used for another request before")]
     RequestIdReused {
-        /// Which.
+        /// The request id.
         id: String,
     },
-    /// A request that was done in an earlier session of this id, of which only a part ended with that.
+    /// The request was performed in an earlier session with this id, and only a part of its effect ended with that session.
     #[error(
         "request id `{id}` was done in an earlier session of this id, and only a part of it ended with that session: ask with another request \
          id for what is missing"
     )]
     DoneInPart {
-        /// Which.
+        /// The request id.
         id: String,
     },
 }
@@ -150,9 +150,9 @@ fn owner_of(opened_by: &str) -> &str {
     }
 }
 
-/// Whose share a bound in all is.
+/// The limit applies to all callers together.
 pub(crate) const ALL: &str = "all callers";
-/// Whose share it is without what is kept for operators.
+/// The limit applies to all callers except operators.
 pub(crate) const ALL_BUT_OPERATORS: &str = "all who are no operators";
 
 pub(crate) fn check_owner(

@@ -1,4 +1,4 @@
-//! Outputs of the pool besides direct answers: answers to waiting requests, and the events for watches.
+//! Outputs of the pool besides direct answers: answers to waiting requests, and events for watches.
 
 use crate::id::{SessionId, WaiterId};
 use crate::resource::ResourceView;
@@ -8,33 +8,33 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::sync::Arc;
 
-/// Something that happened while a request was handled or time went on.
+/// Something that happened while a request was handled or time passed.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Notice {
-    /// An acquire is granted, at once or after waiting.
+    /// An acquire is granted, immediately or after waiting.
     Granted {
-        /// Which acquire.
+        /// The acquire.
         waiter: WaiterId,
-        /// What it got.
+        /// The lease that it gets.
         lease: Lease,
     },
     /// An acquire will not be granted.
     Refused {
-        /// Which acquire.
+        /// The acquire.
         waiter: WaiterId,
-        /// Why.
+        /// The reason.
         refusal: Refusal,
     },
-    /// A change that watchers see.
+    /// A change for watchers.
     Event(Arc<WatchEvent>),
 }
 
 /// Why a waiter left the queue without a lease.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Refusal {
-    /// Its deadline has passed; what it waited for until then.
+    /// Its deadline has passed.
     Deadline {
-        /// In the words of [`crate::Explanation`].
+        /// What it waited for, in the words of [`crate::Explanation`].
         waited_for: String,
     },
     /// Its client withdrew it.
@@ -46,7 +46,7 @@ pub enum Refusal {
 /// A change of the pool.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WatchEvent {
-    /// The pool's revision with this change; grows by one per event.
+    /// The pool's revision after this change; each event increases it by one.
     pub revision: Revision,
     /// What changed.
     pub change: Change,
@@ -55,67 +55,67 @@ pub struct WatchEvent {
 /// What changed.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Change {
-    /// A resource is there.
+    /// A resource was created.
     ResourceCreated(ResourceView),
-    /// A resource has other attributes or another capacity.
+    /// The attributes or the capacity of a resource changed.
     ResourceUpdated(ResourceView),
-    /// A resource is gone.
+    /// A resource was deleted.
     ResourceDeleted {
-        /// As it was before.
+        /// The resource as it was before.
         resource: ResourceView,
-        /// Why.
+        /// The reason.
         reason: EndReason,
     },
-    /// A resource vanished while somebody held it; the rest of the lease stays.
+    /// A resource was deleted while a lease held it; the lease keeps its other resources.
     ResourceLost {
         /// The holder's lease.
         lease: LeaseId,
-        /// Its token.
+        /// The token of the lease.
         token: FencingToken,
         /// The holder.
         session: SessionId,
-        /// What it lost, as it was before.
+        /// The lost resource, as it was before.
         resource: ResourceView,
     },
-    /// A lease began.
+    /// A lease was granted.
     LeaseGranted {
-        /// Its id.
+        /// The id of the lease.
         lease: LeaseId,
-        /// Its token.
+        /// The token of the lease.
         token: FencingToken,
-        /// Whose.
+        /// The holder.
         session: SessionId,
-        /// Its resources, as they are with it.
+        /// Its resources, as they are after the grant.
         resources: Vec<ResourceView>,
     },
-    /// A lease ended. What it held is free, but for the units of resources whose providers have to confirm standstill.
+    /// A lease ended. What it held is free, except units of resources whose providers have to confirm standstill.
     LeaseEnded {
-        /// Its id.
+        /// The id of the lease.
         lease: LeaseId,
-        /// Its token.
+        /// The token of the lease.
         token: FencingToken,
-        /// Whose it was.
+        /// The holder.
         session: SessionId,
-        /// The resources that it held until now, as they are without it.
+        /// The resources that it held, as they are without the lease.
         resources: Vec<ResourceView>,
-        /// Why.
+        /// The reason.
         reason: EndReason,
     },
-    /// Units that a lease had left when it ended are free: nothing moves for it any more.
+    /// Units that an ended lease had left are free: nothing moves for it any more.
     UnitsFreed {
-        /// The lease that has ended.
+        /// The ended lease.
         lease: LeaseId,
-        /// Its token.
+        /// The token of the lease.
         token: FencingToken,
         /// The resource, as it is now.
         resource: ResourceView,
-        /// The provider has confirmed standstill; else the bound has passed.
+        /// True if the provider has confirmed standstill; false if the bound has passed.
         confirmed: bool,
     },
 }
 
 impl Change {
-    /// The resources that it tells of.
+    /// The resources in this change.
     pub fn resources(&self) -> &[ResourceView] {
         match self {
             Change::ResourceCreated(resource)
@@ -131,26 +131,26 @@ impl Change {
 /// Why a lease or a resource ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum EndReason {
-    /// Its holder released it, its owner deleted it.
+    /// The holder released the lease, or the owner deleted the resource.
     Asked,
-    /// Its session's keep-alive stopped.
+    /// The keep-alives of its session stopped.
     SessionExpired,
     /// Its session was closed.
     SessionClosed,
-    /// The lease's own time is over.
+    /// The maximum holding time of the lease has passed.
     HeldTooLong,
-    /// All of it was deleted or consumed for good.
+    /// All of it was deleted or permanently consumed.
     UsedUp,
-    /// Nobody heard of the grant: as if it had not been made.
+    /// The grant could not be delivered: as if it had not been made.
     Undelivered,
-    /// Somebody else than its holder ended it.
+    /// Somebody other than the holder ended it.
     Revoked,
     /// A provider offers its own resource under the id that a task had given to one.
     Displaced,
 }
 
 impl EndReason {
-    /// Whether the holder itself has ended the lease, or never had it: it says by that that nothing is to move for it any more.
+    /// Whether the holder itself ended the lease, or never had it: nothing needs to move for it any more.
     pub(crate) fn is_the_holders(self) -> bool {
         matches!(self, EndReason::Asked | EndReason::Undelivered)
     }

@@ -1,9 +1,8 @@
-//! Expiry: sessions expire, waiters reach their deadline, leases their end,
-//! and providers the bound within which they confirm standstill.
+//! Expiry: the deadlines of sessions, waiters and leases, and the bounds within which providers confirm standstill.
 //!
-//! Waiters whose session or deadline has passed leave before anything is granted, however late the pool was called. What else is
-//! due ends in the same turn, unless that would take long: then the rest is overdue, and [`Pool::next_deadline`] asks for the next
-//! turn at once. What is overdue is held until it has ended, and nobody gets it meanwhile.
+//! Waiters whose session or deadline has expired leave before anything is granted, however late the pool was called. Everything else that is due ends
+//! in the same turn, unless that would take long: then the rest is overdue, and [`Pool::next_deadline`] asks for the next turn immediately. Overdue
+//! resources stay taken until they have ended.
 
 use crate::event::{EndReason, Refusal};
 use crate::id::{SessionId, Slot, WaiterId};
@@ -12,14 +11,14 @@ use crate::record::Effect;
 use ratn_model::id::LeaseId;
 use ratn_model::time::Timestamp;
 
-/// Resources that are looked at in one turn: some milliseconds.
+/// Number of resources that are read in one turn: some milliseconds.
 const WORK_PER_TURN: usize = 100_000;
-/// And in one call: what others are owed does not make it much longer.
+/// Number of resources that are read in one call, so that postponed work does not make it much longer.
 const WORK_PER_CALL: usize = 20_000;
-/// The end of a lease at a resource takes as long as looking at so many of them.
+/// Ending a lease at a resource costs as much as reading this many resources.
 const WORK_PER_END: usize = 25;
 
-/// How much is done at a time, counted in resources that are looked at.
+/// Work limits, counted in resources that are read.
 #[derive(Debug, Clone)]
 pub(crate) struct Work {
     pub(crate) per_turn: usize,
@@ -32,7 +31,7 @@ impl Default for Work {
     }
 }
 
-/// What ends at a moment.
+/// What ends at some time.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Timer {
     Session(SessionId),
@@ -43,8 +42,7 @@ pub(crate) enum Timer {
 }
 
 impl Pool {
-    /// The next moment at which time alone changes something: call [`Pool::advance`] then. At once, where what a turn does was not
-    /// enough.
+    /// The next time at which something changes by time alone: call [`Pool::advance`] then. Immediately, if one turn was not enough.
     pub fn next_deadline(&self) -> Option<Timestamp> {
         if self.queue.is_behind() || !self.overdue.is_empty() {
             return Some(self.now);
@@ -53,33 +51,33 @@ impl Pool {
         timer.into_iter().chain(self.served_later()).chain(self.queue.growth.look_at()).min()
     }
 
-    /// A turn: ends what has run out by `now`, then grants what became free.
+    /// A turn: ends what has expired by `now`, then grants what became free.
     pub fn advance(&mut self, now: Timestamp) {
         self.turn(now, self.work.per_turn);
     }
 
-    /// As [`Pool::advance`], with less that is put off. Every other method does this first.
+    /// Like [`Pool::advance`], with less postponed work. Every other method calls this first.
     pub(crate) fn begin(&mut self, now: Timestamp) {
         self.turn(now, self.work.per_call);
     }
 
-    /// Whether this turn has done its share.
+    /// Whether this turn has done its share of work.
     pub(crate) fn has_done_enough(&self) -> bool {
         self.worked >= self.enough
     }
 
-    /// The same of what ends: half of the share is for those who wait.
+    /// The same for ending: half of the share is reserved for waiters.
     pub(crate) fn has_ended_enough(&self) -> bool {
         self.worked >= self.enough / 2
     }
 
-    /// So many holdings have ended.
+    /// Counts the work for this many ended holdings.
     pub(crate) fn ended(&mut self, holdings: usize) {
         self.worked += WORK_PER_END * holdings;
     }
 
     fn turn(&mut self, now: Timestamp, enough: usize) {
-        // A clock that goes back is a clock that stands still.
+        // If the clock goes back, time stands still.
         self.now = self.now.max(now);
         (self.worked, self.enough) = (0, enough);
         let now = self.now;
@@ -108,7 +106,7 @@ impl Pool {
         }
     }
 
-    /// Ends what is due, as much of it as a turn may.
+    /// Ends what is due, up to the limit of a turn.
     pub(crate) fn end_overdue(&mut self) {
         while !self.has_ended_enough()
             && let Some(timer) = self.overdue.first().cloned()
@@ -123,11 +121,11 @@ impl Pool {
                     self.ended(1);
                     self.commit(Effect::UnitsFreed { lease, slot, confirmed: false });
                 }
-                // It leaves at its deadline.
+                // The waiter leaves at its deadline.
                 Timer::Waiter(_) => drop(self.overdue.remove(&timer)),
             }
         }
-        // Also after a restart they go on ending.
+        // Recorded, so that they continue to end after a restart.
         let begun = |timer: &Timer| if let Timer::Session(id) = timer { Some(id.clone()) } else { None };
         let begun: Vec<SessionId> = self.overdue.iter().map_while(begun).collect();
         for session in begun {
@@ -137,7 +135,7 @@ impl Pool {
         }
     }
 
-    /// Nothing is to end any more at a moment, or what was due has ended.
+    /// Removes a timer: it is not needed any more, or has ended.
     pub(crate) fn stop_timer(&mut self, at: Timestamp, timer: Timer) {
         self.overdue.remove(&timer);
         self.timers.remove(&(at, timer));

@@ -1,4 +1,4 @@
-//! Explanations: which resources a waiting request lacks, and which leases and requests stand before it.
+//! Explanations: which resources a waiting request lacks, and which leases and requests are in its way.
 
 use crate::assignment::{Assignment, Available};
 use crate::id::{SessionId, WaiterId};
@@ -12,69 +12,69 @@ use ratn_model::time::Timestamp;
 use std::fmt;
 use std::time::Duration;
 
-/// How many holders and waiters ahead an obstacle names at the most.
+/// Maximum number of holders, and of waiters ahead, that an obstacle names.
 const MAX_NAMED: usize = 8;
 
 /// Why a waiter is still in the queue.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Explanation {
-    /// Who waits.
+    /// The waiter.
     pub waiter: WaiterId,
-    /// How many are served before it.
+    /// The number of waiters that are served before it.
     pub ahead: usize,
-    /// Since when it waits, or what it has taken the place of.
+    /// Since when it, or the request that it replaces, has waited.
     pub asked: Timestamp,
-    /// What its session is beside others.
+    /// The standing of its session.
     pub standing: Standing,
-    /// What is in the way, in the order of its requirements.
+    /// The obstacles, in the order of its requirements.
     pub obstacles: Vec<Obstacle>,
 }
 
-/// What is in the way of one requirement.
+/// The obstacle to one requirement.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Obstacle {
-    /// No resource of that kind is there.
+    /// No resource of the kind exists.
     MissingKind {
         /// The requirement.
         requirement: String,
         /// The kind.
         kind: String,
-        /// Why those who could provide it do not, in their words.
+        /// Why no provider creates one, as reported by the providers.
         reasons: Vec<String>,
     },
-    /// Resources of the kind are there, but too few that fit.
+    /// Resources of the kind exist, but too few that fit.
     TooFew {
         /// The requirement.
         requirement: String,
-        /// How many units that fit exist.
+        /// The number of existing units that fit.
         exist: Quantity,
-        /// How many of those could be given for this requirement beside the others of its request, if nobody held any.
+        /// How many of these units would serve this requirement beside the others of its request, if nobody held any.
         of_use: Quantity,
-        /// Whether it asks for a part of a unit and all that fits is given in whole units.
+        /// Whether it asks for a fraction of a unit, and everything that fits is only given in whole units.
         undivided: bool,
-        /// Why those who could provide more do not, in their words.
+        /// Why no provider creates more, as reported by the providers.
         reasons: Vec<String>,
     },
-    /// Enough is there, but others hold it.
+    /// Enough exists, but others hold it.
     Held {
         /// The requirement.
         requirement: String,
-        /// Who: lease, session, and what it is held for.
+        /// The holders: lease, session, and purpose.
         holders: Vec<(LeaseId, SessionId, String)>,
-        /// What a lease that has ended has left: lease, resource, the provider that is to confirm standstill, and its bound.
+        /// Units left by ended leases: lease, resource, the provider that has to confirm standstill, and its bound.
         ending: Vec<(LeaseId, String, Option<SessionId>, Duration)>,
     },
-    /// Enough is free, but waiters ahead need it.
+    /// Enough is free, but it is reserved for waiters ahead.
     Reserved {
         /// The requirement.
         requirement: String,
-        /// Waiters ahead that want the same kind.
+        /// The waiters ahead that want the same kind.
         waiters: Vec<WaiterId>,
     },
 }
 
 impl Explanation {
-    /// Whether it would get what it wants if others gave it back: all of that is there.
+    /// Whether it would be served if others released everything: all that it wants exists.
     pub fn is_hopeful(&self) -> bool {
         let is_there = |one: &Obstacle| !matches!(one, Obstacle::MissingKind { .. } | Obstacle::TooFew { .. });
         self.obstacles.iter().all(is_there)
@@ -93,17 +93,17 @@ impl Explanation {
 }
 
 impl Pool {
-    /// What a waiter waits for; `None` if it is not in the queue.
+    /// Why a waiter waits; `None` if it is not in the queue.
     pub fn explain(&self, id: WaiterId) -> Option<Explanation> {
         self.explained(id).map(|(explanation, _)| explanation)
     }
 
-    /// The same, and how many resources and waiters were looked at for it.
+    /// The same, with the number of resources and waiters that were read.
     pub(crate) fn explained(&self, id: WaiterId) -> Option<(Explanation, usize)> {
         let waiter = self.queue.get(id)?;
         let ahead = self.queue.order.range(..waiter.place(id)).count();
         let requirements: Vec<&Requirement> = waiter.request.requirements.iter().collect();
-        // What others have reserved: nobody behind it has anything that it wants.
+        // Including what others have reserved: no waiter behind this one has reserved anything that it wants.
         let available = Available::FreeTo(&self.queue.reserved, &waiter.reserved);
         let free = Assignment::of(&self.resources, available, &requirements);
         let unreserved = Assignment::of(&self.resources, Available::Free(&Units::new()), &requirements);
@@ -113,7 +113,7 @@ impl Pool {
             .filter(|index| !free.missing[*index].is_zero())
             .map(|index| {
                 let requirement = requirements[index];
-                // Twice all of the kind, or those who wait before it.
+                // Twice all resources of the kind, or the waiters ahead.
                 looked_at += 2 * self.resources.count(&requirement.kind) + ahead;
                 let held = !unreserved.missing[index].is_zero();
                 self.obstacle(id, requirement, existing.missing[index], held)
@@ -123,7 +123,7 @@ impl Pool {
         Some((Explanation { waiter: id, ahead, asked, standing, obstacles }, looked_at))
     }
 
-    /// `lacking`: so much could not be given if nobody held anything. `held`: others hold what is lacking now.
+    /// `lacking`: the amount that would be missing even if nobody held anything. `held`: others hold what is missing now.
     fn obstacle(&self, id: WaiterId, requirement: &Requirement, lacking: Quantity, held: bool) -> Obstacle {
         let text = requirement.to_string();
         if !self.resources.has_kind(&requirement.kind) {
@@ -170,7 +170,7 @@ impl Pool {
 }
 
 impl Pool {
-    /// What leases that have ended have left of what fits.
+    /// Units that ended leases have left of matching resources.
     fn ending_of(&self, requirement: &Requirement) -> Vec<(LeaseId, String, Option<SessionId>, Duration)> {
         let fitting = self.resources.fitting(requirement).filter(|_| !self.ending.is_empty());
         let left = fitting.flat_map(|(slot, resource)| {

@@ -1,5 +1,5 @@
-//! Groups of waiting requests: those whose requirements select the same resources form a group, and groups whose resources may
-//! overlap (of one kind) a family. A change of a resource touches only the groups that it fits (`changed.rs`).
+//! Groups of waiting requests: requirements that select the same resources form a group, and groups whose resources may overlap (in kinds) form a
+//! family. A change of a resource affects only the groups that it fits (`changed.rs`).
 
 use crate::id::Slot;
 use crate::pool::Pool;
@@ -11,29 +11,29 @@ use ratn_model::versioned;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// What a requirement selects, in bytes.
+/// The selector of a requirement, in bytes.
 pub(crate) type Key = Arc<[u8]>;
 
-/// Waiters that want the same.
+/// Waiters with the same selector.
 #[derive(Debug, Clone)]
 pub(crate) struct Group {
     pub(crate) selector: Requirement,
     pub(crate) family: Arc<str>,
-    /// Hopeful ones that lack something of the family.
+    /// Hopeful waiters that lack something of the family.
     pub(crate) wanting: BTreeSet<Place>,
-    /// Everybody in it, by how much they want.
+    /// All waiters, ordered by the amount that they want.
     pub(crate) by_amount: BTreeSet<(Quantity, Place)>,
-    /// Those of them with several requirements in the family, and those who want parts of units: for these it is not enough to count.
+    /// Waiters with several requirements in the family, or that want fractions of units: for these, counting is not enough.
     pub(crate) several: BTreeSet<Place>,
-    /// Those of them for whom what exists would not do, and who lack something of it.
+    /// Waiters that existing resources would not satisfy, and that lack something of this group.
     pub(crate) lacking: BTreeSet<Place>,
-    /// Requirements in it.
+    /// The number of requirements in it.
     pub(crate) members: usize,
-    /// How much there is, held or not.
+    /// The amount that exists, held or not.
     pub(crate) existing: Quantity,
-    /// How many of the resources that fit are divisible. With some it is enough to count for nobody: parts of two are no whole unit.
+    /// The number of divisible resources that fit. If there are any, counting is enough for no waiter: fractions of two units make no whole unit.
     pub(crate) divisible: usize,
-    /// Those of which something is free, and some that were, where not simply every resource of the kind fits.
+    /// The resources that are free, and some that were; `None` if every resource of the kind fits.
     pub(crate) free: Option<BTreeSet<Slot>>,
 }
 
@@ -41,17 +41,17 @@ pub(crate) struct Group {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Family {
     pub(crate) groups: BTreeSet<Key>,
-    /// Hopeful ones that take something of it.
+    /// Hopeful waiters that take units of the family.
     pub(crate) takers: BTreeSet<Place>,
-    /// Those of them that have reserved some.
+    /// Those of them that have reserved units.
     pub(crate) reserving: BTreeSet<Place>,
-    /// Those that must not be overtaken any more: they and all before them reserve.
+    /// Those of them that must not be overtaken any more: they and all before them reserve.
     pub(crate) strict: BTreeSet<Place>,
-    /// Requirements in it of those of whom it is to be found out whether what exists would do.
+    /// The number of requirements in it whose waiters have to be re-examined.
     pub(crate) doubtful: usize,
 }
 
-/// A resource before or after a change.
+/// The state of a resource before or after a change.
 #[derive(Debug, Clone)]
 pub(crate) struct Seen {
     pub(crate) description: Arc<Description>,
@@ -88,7 +88,7 @@ impl Group {
         resources.fits(description, &self.selector)
     }
 
-    /// Whether it knows how much exists for it, and everything of which something is free.
+    /// Whether the group knows how much exists for it, and all its free resources.
     pub(crate) fn knows(&self, resources: &Resources) -> bool {
         let known = |(slot, _)| self.free.as_ref().is_none_or(|free| free.contains(&slot));
         self.existing == resources.quantity(&self.selector)
@@ -96,7 +96,7 @@ impl Group {
             && resources.free(&self.selector).all(known)
     }
 
-    /// Whether there is nothing left of what fits, beside what is reserved; and how many resources were looked at.
+    /// Whether nothing that fits is left besides reservations; and the number of resources that were read.
     pub(crate) fn exhausted(&mut self, resources: &Resources, reserved: &Units) -> (bool, usize) {
         let (mut looked_at, mut taken) = (0, Vec::new());
         let mut left = |slot: &Slot| {
@@ -121,7 +121,7 @@ impl Group {
 }
 
 impl Pool {
-    /// Puts a waiter into the queue and its groups.
+    /// Adds a waiter to the queue and its groups.
     pub(crate) fn join(&mut self, id: crate::id::WaiterId, waiter: Waiter) {
         let place = waiter.place(id);
         let mut families: Vec<Arc<str>> = Vec::new();
@@ -155,7 +155,7 @@ impl Pool {
         self.queue.doubt(place);
     }
 
-    /// Takes a waiter from the queue and its groups. What it had reserved is free for others, unless it gets that.
+    /// Removes a waiter from the queue and its groups. Its reservations are free for others, unless they are granted to it.
     pub(crate) fn part(&mut self, id: crate::id::WaiterId, granted: bool) -> Option<Waiter> {
         self.stop_wanting(id, granted);
         let place = self.queue.get(id)?.place(id);
@@ -186,7 +186,7 @@ impl Pool {
         Some(waiter)
     }
 
-    /// A waiter reserves nothing and wants nothing, though it stays.
+    /// A waiter gives up its reservations and wants nothing, but stays in the queue.
     pub(crate) fn give_up(&mut self, id: crate::id::WaiterId) {
         self.stop_wanting(id, false);
     }
@@ -207,7 +207,7 @@ impl Pool {
                 family.reserving.remove(&place);
                 family.strict.remove(&place);
             }
-            // Without one who lacked it, others may reserve what is free.
+            // One waiter less lacks it, so others may reserve what is free.
             let freed = !units.is_empty() && !granted;
             if freed || ((wanted || granted) && self.limits.overtaken > 0) {
                 self.queue.mark(&family, false);

@@ -1,9 +1,9 @@
-//! Growth: what requests have waited for so long that their providers are to start more of it, although what exists would do.
+//! Growth: what requests have waited for so long that its providers should start more, although existing resources would suffice.
 //!
-//! A request counts when it has waited for [`Provided::patience`] without a break for units that others hold, of a kind that a provider
-//! grows, and when one more unit of that is all that it needs: who also waits for an arm would not begin any sooner. Waits that end before
-//! that start nothing. The queue is looked at as often as the patience is long, and only while somebody waits, so a wait counts for
-//! up to as long after it has ended.
+//! A request counts when it has waited for [`Provided::patience`] without interruption for units that others hold, of a kind that a provider grows,
+//! and if one more unit of that kind is all that it needs: a request that also waits for an arm would not begin any sooner. Shorter waits start
+//! nothing. The queue is examined at intervals of the patience, and only while requests wait, so a wait counts for up to the same time after it has
+//! ended.
 
 use crate::group::{Group, Key};
 use crate::pool::Pool;
@@ -13,32 +13,32 @@ use ratn_model::time::Timestamp;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-/// Waiters of one selector that are looked at, the most urgent ones.
+/// Maximum number of waiters examined per selector; the most urgent ones.
 const LOOKED_AT: usize = 64;
-/// Resources that are looked at for waiters of several kinds in one look; those behind count with the next one.
+/// Maximum number of resources read per examination for waiters of several kinds; the rest counts in the next one.
 const RESOURCES: usize = 10_000;
 
-/// What those who provide say that they do.
+/// What the providers offer to start.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Provided {
     /// The kinds that are started for requests that wait for more than exists.
     pub kinds: BTreeSet<String>,
-    /// Of these, those that are started as well for requests that wait for what is held.
+    /// The kinds among these that are also started for requests that wait for held resources.
     pub growing: BTreeSet<String>,
-    /// How long a request waits for what is held before it counts.
+    /// How long a request has to wait for held resources before it counts.
     pub patience: Duration,
 }
 
-/// When the queue is looked at, and what was found.
+/// When the queue is examined, and the result.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Growth {
     look_at: Option<Timestamp>,
     is_due: bool,
-    /// Something was found in the last look.
+    /// The last examination found something.
     was_found: bool,
 }
 
-/// What waits of one selector: how much, and the most urgent one of it.
+/// For each selector, the waiting amount, and the most urgent waiter.
 pub(crate) type Queued = BTreeMap<Key, (Quantity, Place)>;
 
 impl Growth {
@@ -46,14 +46,14 @@ impl Growth {
         self.look_at
     }
 
-    /// It is looked at again, unless it will be anyway.
+    /// Schedules the next examination, unless one is scheduled.
     pub(crate) fn look_later(&mut self, now: Timestamp, provided: &Provided) {
         if self.look_at.is_none() && !provided.growing.is_empty() {
             self.look_at = Some(now + provided.patience);
         }
     }
 
-    /// Time goes on.
+    /// Time passes.
     pub(crate) fn advance(&mut self, now: Timestamp) {
         if self.look_at.is_some_and(|at| at <= now) {
             (self.look_at, self.is_due) = (None, true);
@@ -64,7 +64,7 @@ impl Growth {
         self.is_due
     }
 
-    /// It was looked at; whether something is or was found.
+    /// The queue was examined; returns whether something is or was found.
     fn looked(&mut self, found: bool) -> bool {
         self.is_due = false;
         std::mem::replace(&mut self.was_found, found) || found
@@ -72,8 +72,8 @@ impl Growth {
 }
 
 impl Pool {
-    /// What has been waited for for long enough, by selector; whether that may be something else than at the last look. It is looked at
-    /// again while somebody waits.
+    /// What has been waited for long enough, by selector; and whether it may have changed since the last examination. Schedules the next one while
+    /// requests wait.
     pub(crate) fn look_for_growth(&mut self) -> (Queued, bool) {
         let (mut queued, mut somebody, mut resources) = (Queued::new(), false, RESOURCES);
         for (key, group) in &self.queue.groups {
@@ -99,7 +99,7 @@ impl Pool {
             && self.resources.kinds().subclasses(&group.selector.kind).any(|kind| growing.contains(kind))
     }
 
-    /// What a waiter lacks of a selector, where it has waited for long enough and lacks nothing else.
+    /// What a waiter lacks of a selector, if it has waited long enough and lacks nothing else.
     fn has_waited_for(&self, waiter: &Waiter, key: &Key, group: &Group, resources: &mut usize) -> Option<Quantity> {
         if waiter.hopeful_since + self.queue.provided.patience > self.now {
             return None;

@@ -1,25 +1,25 @@
-//! The last events, for watches that begin at an earlier revision.
+//! The latest events, for watches that begin at an earlier revision.
 
 use crate::event::WatchEvent;
 use ratn_model::id::Revision;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// The newest events, the oldest first; without a gap.
+/// The latest events, oldest first, without gaps.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct History {
     events: VecDeque<Arc<WatchEvent>>,
 }
 
-/// The events after a revision are not all there any more.
+/// Some events after a revision are no longer kept.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}", self.text())]
 pub struct Compacted {
-    /// From where was asked.
+    /// The requested revision.
     pub after: Revision,
-    /// The oldest revision after which everything is known.
+    /// The oldest revision after which all events are kept.
     pub oldest: Revision,
-    /// The newest.
+    /// The newest revision.
     pub newest: Revision,
 }
 
@@ -31,7 +31,7 @@ impl History {
         }
     }
 
-    /// What happened after a revision, in order, when `newest` is the pool's.
+    /// The events after a revision, in order, if the pool is at `newest`.
     pub(crate) fn after(&self, after: Revision, newest: Revision) -> Result<Vec<Arc<WatchEvent>>, Compacted> {
         let oldest = Revision(newest.0 - self.events.len() as u64);
         if after < oldest || after > newest {

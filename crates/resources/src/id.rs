@@ -1,27 +1,26 @@
-//! The ids of sessions and waiters, and the slots of resources. Outside, resources are named by plain strings
-//! (`path-planner-1@compute`).
+//! The ids of sessions and waiters, and the slots of resources. To the outside, resources are named by strings (`path-planner-1@compute`).
 
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::sync::Arc;
 
-/// A client's session, named by the client: what it holds and provides lives as long as its keep-alive.
+/// A client's session, named by the client: what it holds and provides lives as long as its keep-alives continue.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct SessionId(Arc<str>);
 
 ratn_model::number_id!(
-    /// A queued acquire; numbered in the order of arrival.
+    /// A queued acquire; numbered in order of arrival.
     WaiterId, "waiter-"
 );
 
-/// Where a resource is in the pool's table; in records it stands for the resource.
+/// The index of a resource in the pool's table; records use it to identify the resource.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(transparent)]
 pub(crate) struct Slot(u32);
 
 impl Slot {
-    /// Tables are far shorter than a `u32` goes: [`crate::Limits::resources`].
+    /// Tables are much shorter than the range of `u32`: [`crate::Limits::resources`].
     pub(crate) fn new(index: usize) -> Slot {
         Slot(u32::try_from(index).unwrap_or(u32::MAX))
     }

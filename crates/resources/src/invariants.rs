@@ -1,4 +1,4 @@
-//! Invariants that hold between two calls; checked after every step of simulated runs and property tests.
+//! Invariants between calls; checked after every step of simulated runs and property tests.
 
 use crate::caller::Callers;
 use crate::expiry::Timer;
@@ -8,15 +8,15 @@ use ratn_model::time::Timestamp;
 use std::collections::BTreeSet;
 
 impl Pool {
-    /// Says what is broken, if anything is.
+    /// Checks all invariants.
     ///
     /// # Errors
-    /// The first invariant that does not hold, in words.
+    /// The first violated invariant, in words.
     pub fn check_invariants(&self) -> Result<(), String> {
         for (slot, resource) in self.resources.iter() {
             let id = &resource.description.id;
             let (held, consumed, free) = (resource.held(), resource.consumed(), resource.free());
-            // A provider may shrink a capacity below what is given out; then nothing more is free.
+            // A provider may reduce a capacity below what is given out; then nothing is free.
             let capacity = resource.description.capacity;
             ensure(free.is_zero() || held + consumed + free == capacity, || {
                 format!("{id}: held {held} + consumed {consumed} + free {free} is not its capacity {capacity}")
@@ -82,7 +82,7 @@ impl Pool {
             ensure(waiter.request.deadline.is_none_or(|deadline| deadline > self.now), || {
                 format!("{id} waits beyond its deadline")
             })?;
-            // No lost wake-up: whoever can be served has been.
+            // No lost wake-up: every waiter that can be served has been.
             let obstacles = self.explain(id).map_or(0, |explanation| explanation.obstacles.len());
             let session = self.sessions.get(&waiter.request.session);
             let may_have = session.is_some_and(|session| self.may_grant_to(session));

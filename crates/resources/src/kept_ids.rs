@@ -1,16 +1,16 @@
-//! Ids of sessions that have ended. Each is kept for a while for the caller that opened its session, so that nobody else opens a session of
-//! that id before its owner returns: the owner would be refused from then on.
+//! Ids of ended sessions. Each is kept for a while for the caller that opened its session, so that nobody else opens a session with that id before
+//! its owner returns, who would then be refused.
 //!
-//! Bounded by number and by age, and for each caller by number. A caller's own oldest ids are given up first; where all callers together
-//! have too many, those of the caller with the most. So nobody's sessions make the manager give up the ids of a caller with fewer.
-//! If the opener of a session is unknown, its id is not kept.
+//! Limited by number and age, and by number per caller. A caller's own oldest ids are dropped first; if all callers together have too many, those of
+//! the caller with the most. So no caller can make the manager drop the ids of a caller with fewer. If the opener of a session is unknown, its id is
+//! not kept.
 //!
-//! An id is kept by the record that ends its session, and given up by the one that opens the next: nothing else is written down. After a
-//! restart the time begins anew, and a replay may keep more ids than there were: those that had been given up for their age, or under narrower
-//! bounds, are kept again, within the bounds of now.
+//! An id is kept by the record that ends its session, and dropped by the record that opens the next; nothing else is recorded. After a restart the
+//! time begins anew, and a replay may keep more ids than before: those that had been dropped because of age or of smaller limits are kept again,
+//! within the present limits.
 //!
-//! Every caller that may open sessions can reserve ids of its choice by opening and ending sessions of them. Ids of the project's own parts are fresh, and
-//! nobody guesses them. `keep_session_ids_for_ms = 0` keeps none, also of those that are there.
+//! Every caller that may open sessions can reserve ids of its choice by opening and ending such sessions. Ids of the project's own parts are fresh
+//! and cannot be guessed. `keep_session_ids_for_ms = 0` keeps no ids, including existing ones.
 
 use crate::id::SessionId;
 use crate::limits::Limits;
@@ -23,9 +23,9 @@ use std::time::Duration;
 #[derive(Debug, Clone, Default)]
 pub(crate) struct KeptIds {
     ids: BTreeMap<SessionId, Kept>,
-    /// The oldest first.
+    /// Oldest first.
     order: BTreeMap<u64, SessionId>,
-    /// What is kept for each caller, the oldest first.
+    /// The ids kept for each caller, oldest first.
     callers: BTreeMap<Arc<str>, BTreeSet<u64>>,
     next: u64,
 }
@@ -39,12 +39,12 @@ struct Kept {
 }
 
 impl KeptIds {
-    /// For whom an id is kept, if it is.
+    /// The caller for whom an id is kept, if it is.
     pub(crate) fn opener(&self, id: &SessionId, now: Timestamp, limits: &Limits) -> Option<&Arc<str>> {
         self.ids.get(id).filter(|kept| now < kept.since + lifetime(limits)).map(|kept| &kept.opened_by)
     }
 
-    /// A session has ended: its id is kept for who opened it.
+    /// Keeps the id of an ended session for the caller who opened it.
     pub(crate) fn keep(&mut self, id: &SessionId, opened_by: &Arc<str>, now: Timestamp, limits: &Limits) {
         self.give_up(id);
         if opened_by.is_empty() {
@@ -60,7 +60,7 @@ impl KeptIds {
         }
     }
 
-    /// An id is nobody's any more, or a session has it again.
+    /// Drops an id: it is free, or a session uses it again.
     pub(crate) fn give_up(&mut self, id: &SessionId) {
         let Some(Kept { number, opened_by, .. }) = self.ids.remove(id) else { return };
         self.order.remove(&number);
@@ -72,7 +72,7 @@ impl KeptIds {
         }
     }
 
-    /// One that has to go after one of a caller was kept.
+    /// An id to drop after one was kept for `caller`.
     fn surplus(&self, caller: &str, now: Timestamp, limits: &Limits) -> Option<SessionId> {
         let (_, oldest) = self.order.first_key_value()?;
         if self.ids.get(oldest).is_some_and(|kept| kept.since + lifetime(limits) <= now) {
@@ -84,12 +84,12 @@ impl KeptIds {
         self.order.get(of.first()?).cloned()
     }
 
-    /// Every id with whom it is kept for, the oldest first.
+    /// Every kept id with its caller, oldest first.
     pub(crate) fn iter(&self) -> impl Iterator<Item = (&SessionId, &Arc<str>)> {
         self.order.values().filter_map(|id| Some((id, &self.ids.get(id)?.opened_by)))
     }
 
-    /// Whether the indices say the same.
+    /// Whether the indices agree.
     pub(crate) fn agree(&self) -> bool {
         let listed = |(id, kept): (&SessionId, &Kept)| {
             self.order.get(&kept.number) == Some(id)

@@ -1,40 +1,40 @@
-//! Subclasses of kinds: a request for a `Gripper` may be granted a `VacuumGripper`.
+//! Subclasses of kinds: a request for a `Gripper` may get a `VacuumGripper`.
 //!
 //! ```text
-//!   Tool ◀── Gripper ◀── VacuumGripper        one family: what fits a request for one kind may fit one for another
+//!   Tool ◀── Gripper ◀── VacuumGripper        one family: a resource may fit requests for several of its kinds
 //!     ▲───── Camera
 //! ```
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// A hierarchy of kinds. A kind that it does not name stands alone.
+/// A hierarchy of kinds. Kinds that are not in it have no relations.
 #[derive(Debug, Clone, Default)]
 pub struct Kinds(Arc<BTreeMap<Box<str>, Related>>);
 
 #[derive(Debug, Clone, Default)]
 struct Related {
-    /// All above it, near and far, in the order of names.
+    /// All direct and indirect superclasses, ordered by name.
     superclasses: Vec<String>,
-    /// Itself, then all below it, the most general first.
+    /// The kind itself, then all subclasses, the most general first.
     subclasses: Vec<Box<str>>,
-    /// The same for all that are connected.
+    /// The same for all connected kinds.
     family: Box<str>,
 }
 
-/// A hierarchy in which a kind is above itself.
+/// The hierarchy has a cycle.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("the kind `{kind}` is a subclass of itself: take one of its superclasses away")]
 pub struct CyclicKinds {
-    /// One of those in the circle.
+    /// A kind in the cycle.
     pub kind: String,
 }
 
 impl Kinds {
-    /// From the direct superclasses of each kind.
+    /// Builds the hierarchy from the direct superclasses of each kind.
     ///
     /// # Errors
-    /// Where a kind is above itself.
+    /// A kind is its own superclass.
     pub fn new(direct: &BTreeMap<String, Vec<String>>) -> Result<Kinds, CyclicKinds> {
         let named: BTreeSet<&str> =
             direct.iter().flat_map(|(kind, above)| above.iter().chain([kind])).map(String::as_str).collect();
@@ -59,30 +59,30 @@ impl Kinds {
         Ok(Kinds(Arc::new(named.iter().map(related).collect())))
     }
 
-    /// All kinds above one, in the order of names.
+    /// All superclasses of a kind, ordered by name.
     pub fn superclasses(&self, kind: &str) -> &[String] {
         self.0.get(kind).map_or(&[], |related| &related.superclasses)
     }
 
-    /// Whether one is the other or below it.
+    /// Whether `kind` is `wanted` or a subclass of it.
     pub fn is_a(&self, kind: &str, wanted: &str) -> bool {
         kind == wanted || self.superclasses(kind).iter().any(|superclass| superclass == wanted)
     }
 
-    /// The kind itself, then all below it.
+    /// The kind itself, then all its subclasses.
     pub(crate) fn subclasses<'a>(&'a self, kind: &'a str) -> impl Iterator<Item = &'a str> + 'a {
         let known = self.0.get(kind);
         let alone = known.is_none().then_some(kind);
         alone.into_iter().chain(known.into_iter().flat_map(|related| related.subclasses.iter().map(|below| &**below)))
     }
 
-    /// The family of a kind: kinds of different families have no resource in common.
+    /// The family of a kind: kinds of different families share no resource.
     pub(crate) fn family<'a>(&'a self, kind: &'a str) -> &'a str {
         self.0.get(kind).map_or(kind, |related| &related.family)
     }
 }
 
-/// What is above a kind, near and far; itself only where the hierarchy is a circle.
+/// The direct and indirect superclasses of a kind; contains the kind itself only if the hierarchy has a cycle.
 fn reached<'a>(direct: &'a BTreeMap<String, Vec<String>>, kind: &str) -> BTreeSet<&'a str> {
     let mut reached = BTreeSet::new();
     let mut open: Vec<&str> = direct.get(kind).into_iter().flatten().map(String::as_str).collect();

@@ -1,4 +1,4 @@
-//! Live leases, and those that have ended while something may still move for them.
+//! Live leases, and ended leases for which something may still move.
 
 use crate::event::EndReason;
 use crate::id::{SessionId, Slot};
@@ -14,23 +14,23 @@ use std::time::Duration;
 /// By id.
 pub(crate) type Leases = BTreeMap<LeaseId, LeaseRecord>;
 
-/// By id; none of them lives.
+/// By id; these leases have ended.
 pub(crate) type EndingLeases = BTreeMap<LeaseId, EndingLease>;
 
-/// What is left of a lease that has ended: units whose providers have not confirmed standstill.
+/// What is left of an ended lease: units whose providers have not confirmed standstill.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct EndingLease {
     pub(crate) token: FencingToken,
     pub(crate) session: SessionId,
     pub(crate) reason: EndReason,
-    /// Which resources, and when their units are free at the latest; counted anew after a restart.
+    /// For each resource, when its units are free at the latest; restarted after a restart.
     pub(crate) slots: BTreeMap<Slot, Bound>,
-    /// Who opened the session; kept beside it.
+    /// The caller who opened the session; stored separately.
     #[serde(skip)]
     pub(crate) opened_by: Arc<str>,
 }
 
-/// When units are free whatever the provider says; of no interest to another process.
+/// When units are free even without confirmation; only valid in this process.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Bound(#[serde(skip)] pub(crate) Timestamp);
 
@@ -47,44 +47,44 @@ impl EndingLease {
     }
 }
 
-/// A live lease. The resources know it too (as a holder), so that what is free is found without looking at every lease.
+/// A live lease. The resources also list it as a holder, so that free units are found without reading every lease.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct LeaseRecord {
     pub(crate) token: FencingToken,
     pub(crate) session: SessionId,
     /// What it holds, in the order of the requirements.
     pub(crate) held: Vec<(Slot, Quantity)>,
-    /// What was consumed when it was granted, as long as that could be taken back: with a grant that nobody heard of it is.
+    /// What was consumed by the grant, as long as that can be undone: it is if the grant could not be delivered.
     pub(crate) consumed: Vec<(Slot, Quantity)>,
     pub(crate) hold_for: Option<Duration>,
     pub(crate) purpose: Arc<str>,
-    /// Who opened its session; of the session, where it is kept.
+    /// The caller who opened the session; stored with the session.
     #[serde(skip)]
     pub(crate) opened_by: Arc<str>,
-    /// When it ends by itself; counted anew after a restart.
+    /// When it expires; restarted after a restart.
     #[serde(skip)]
     pub(crate) expires: Option<Timestamp>,
 }
 
-/// A live lease as others see it.
+/// A live lease as seen by others.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LeaseView {
     /// Its id.
     pub id: LeaseId,
     /// Its fencing token.
     pub token: FencingToken,
-    /// Whose it is.
+    /// The holder.
     pub session: SessionId,
-    /// The ids of the resources held, in order.
+    /// The ids of the held resources, in order.
     pub resources: Vec<String>,
-    /// When it ends by itself.
+    /// When it expires.
     pub expires: Option<Timestamp>,
-    /// What it was acquired for.
+    /// The purpose given in the acquire.
     pub purpose: Arc<str>,
 }
 
 impl LeaseRecord {
-    /// The slots held, each once, in order.
+    /// The held slots, each once, in order.
     pub(crate) fn slots(&self) -> Vec<Slot> {
         let mut slots: Vec<Slot> = self.held.iter().map(|(slot, _)| *slot).collect();
         slots.sort_unstable();

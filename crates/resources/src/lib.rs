@@ -7,23 +7,21 @@
 //!      │ no keep alive for its TTL                      └─────▶ refused (deadline, cancelled, session gone)
 //!      └▶ its resources vanish, its leases end, its waiters leave, its consumption returns
 //!
-//!   a lease that ends otherwise than by its holder's release leaves units whose provider has to stop something:
+//!   a lease that does not end by its holder's release leaves units if the provider has to stop something:
 //!   leased ──▶ ending ──▶ free (its provider confirmed standstill, or its bound has passed)
 //!
-//!   call ──▶ Pool decides ──▶ Record ──▶ apply (the only thing that changes what is durable) ──▶ events
+//!   call ──▶ Pool decides ──▶ Record ──▶ apply (the only code that changes durable state) ──▶ events
 //!                                └──▶ log ──▶ restore: the same apply
 //! ```
 //!
-//! Pure: time comes in as an argument, whatever happens besides the direct answer comes out of [`Pool::take_notices`], and
-//! what has to survive of it out of [`Pool::take_records`]. What is free is computed from the live leases of a resource;
-//! nothing is counted beside them. Grants are made in
-//! strict order of turns (`turn.rs`: certain before speculative, then by time and share, urgency, due time, priority and arrival): a waiter that cannot be served yet reserves every free unit it can use, so a
-//! later one never takes a unit that it waits for, and waiters for other kinds pass. It deliberately knows no socket,
-//! no clock, no file and no process. Starting missing workers is the task of the providers.
+//! Pure: the time is an argument, [`Pool::take_notices`] returns what happens besides the direct answer, and [`Pool::take_records`] returns what has
+//! to be stored durably. Free units are computed from the live leases of a resource; nothing is counted separately. Grants are made in strict order
+//! of turns (`turn.rs`: certain before speculative, then by time and share, urgency, due time, priority and arrival): a waiter that cannot be served
+//! yet reserves every free unit it can use, so a later one never takes a unit that it waits for, while waiters for other kinds pass. It deliberately
+//! uses no socket, clock, file or process. Starting missing workers is the task of the providers.
 //!
-//! Waiters that select the same form a group (`group.rs`); a change of a resource touches the groups that it fits, and what became free
-//! goes to the first who lacks it (`schedule.rs`). `cargo bench -p ratn-resources`, medians on a busy machine with two
-//! cores (compare them with each other):
+//! Waiters with the same selector form a group (`group.rs`); a change of a resource affects the groups that it fits, and free units go to the first
+//! waiter that lacks them (`schedule.rs`). `cargo bench -p ratn-resources`, medians on a busy machine with two cores (compare them with each other):
 //!
 //! | call | empty pool | 100,000 resources | and 10,000 waiters |
 //! |---|---|---|---|

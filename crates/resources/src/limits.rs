@@ -1,66 +1,65 @@
-//! The bounds of everything that a client can make grow.
+//! Limits for everything that clients can make grow.
 
 use serde::{Deserialize, Serialize};
 
-/// Bounds of a pool; a request beyond one is refused with [`crate::PoolError::TooMany`] or
-/// [`crate::PoolError::Malformed`].
+/// Limits of a pool; a request beyond a limit is refused with [`crate::PoolError::TooMany`] or [`crate::PoolError::Malformed`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
-    /// Resources in all.
+    /// Resources in total.
     pub resources: usize,
-    /// Of these, what the sessions of one caller that is no operator provide.
+    /// Of these, resources provided by the sessions of one caller who is not an operator.
     pub resources_per_caller: usize,
-    /// Of all resources, so many are only for operators; at most half of them, as of all that follow.
+    /// Of all resources, the number reserved for operators; at most half of them. The same applies to all `_for_operators` below.
     pub resources_for_operators: usize,
-    /// Sessions in all.
+    /// Sessions in total.
     pub sessions: usize,
-    /// Sessions of one caller that is no operator.
+    /// Sessions of one caller who is not an operator.
     pub sessions_per_caller: usize,
-    /// Of all sessions, so many are only for operators.
+    /// Of all sessions, the number reserved for operators.
     pub sessions_for_operators: usize,
-    /// What the shares of those sessions of one caller that is no operator are together at the most which hold or wait for something of the same
-    /// kinds: where they are more, each counts as so many times less. The usual share of one session is 1.
+    /// Maximum total share of those sessions of one caller, who is not an operator, that hold or wait for something of the same kinds: if they exceed
+    /// it, each share is scaled down accordingly. The usual share of a session is 1.
     pub share_per_caller: u32,
-    /// Ids of sessions that have ended, which are kept for their openers: of the caller with the most, the oldest is given up first.
+    /// Kept ids of ended sessions: of the caller with the most, the oldest id is dropped first.
     pub kept_session_ids: usize,
-    /// Of these, those of one caller: the caller's own oldest is given up first.
+    /// Of these, ids of one caller: the caller's own oldest is dropped first.
     pub kept_session_ids_per_caller: usize,
-    /// And for so long at the most, in milliseconds. Then anybody may open a session of that id.
+    /// Maximum time for which these ids are kept, in milliseconds. Then anybody may open a session with that id.
     pub keep_session_ids_for_ms: u64,
-    /// Queued acquires in all. Who can be served at once does not queue, and is not refused for this.
+    /// Queued acquires in total. An acquire that can be served at once does not queue, and is not refused for this.
     pub waiters: usize,
     /// Queued acquires of all sessions that one caller opened.
     pub waiters_per_caller: usize,
-    /// Of all queued acquires, so many are only for operators.
+    /// Of all queued acquires, the number reserved for operators.
     pub waiters_for_operators: usize,
     /// Queued acquires of one session.
     pub waiters_per_session: usize,
-    /// Different selectors (kind, class, attributes) that are waited for.
+    /// Different selectors (kind, class, attributes) that requests wait for.
     pub selectors: usize,
-    /// Of these, what one caller that is no operator waits for.
+    /// Of these, selectors that one caller who is not an operator waits for.
     pub selectors_per_caller: usize,
-    /// Of all selectors, so many are only for operators.
+    /// Of all selectors, the number reserved for operators.
     pub selectors_for_operators: usize,
-    /// How often a waiter may be overtaken (a later one gets what it waits for) before what it waits for is kept for it. Never
-    /// (0) is the default: the most urgent request is not made later by less urgent ones, and units may be idle until the rest
-    /// of what it waits for comes. A larger number uses them meanwhile.
+    /// How often a waiter may be overtaken (a later one gets what it waits for) before resources are reserved for it. The default is never (0): less
+    /// urgent requests do not delay the most urgent one, but units may be idle until the rest of what it waits for is free. A larger number uses them
+    /// in the meantime.
     pub overtaken: u32,
-    /// Leases in all: those that live, and those that have ended while a provider has not confirmed standstill.
+    /// Leases in total: live ones, and ended ones whose providers have not confirmed standstill.
     pub leases: usize,
-    /// Of these, those of one caller that is no operator; its queued acquires count too, for each may become one.
+    /// Of these, leases of one caller who is not an operator; queued acquires count too, because each may become a lease.
     pub leases_per_caller: usize,
-    /// Of all leases, so many are only for operators.
+    /// Of all leases, the number reserved for operators.
     pub leases_for_operators: usize,
     /// Requirements of one acquire.
     pub requirements: usize,
-    /// Units that one requirement may ask for.
+    /// Units in one requirement.
     pub units: u32,
-    /// Units that the requirements of one request may ask for together: each may be another resource, and all of them are looked
-    /// up, granted, written down and told of in one turn.
+    /// Units in all requirements of one request: each unit may be another resource, and all of them are looked up, granted, recorded and reported in
+    /// one turn.
     pub units_per_request: u32,
-    /// Comparisons of an attribute with a resource that one request may take, should it have to look at every resource of its
-    /// kinds: resources of the kind times attributes and conditions, over its different selectors.
+    /// Comparisons of an attribute with a resource in one request, if every resource of its kinds has to be read: resources of the kind times
+    /// attributes and conditions, summed over its different selectors.
     pub comparisons: usize,
     /// Characters of a name, a kind or a request id.
     pub name_length: usize,
@@ -70,17 +69,17 @@ pub struct Limits {
     pub resource_bytes: usize,
     /// Bytes of a requirement: its kind, attributes and conditions.
     pub requirement_bytes: usize,
-    /// Leases that may hold some of one resource at the same time.
+    /// Leases that may hold units of one resource at the same time.
     pub holders: usize,
-    /// Answers remembered so that a repeated request id is not performed twice; of the caller with the most, the oldest is forgotten first.
+    /// Remembered answers, so that a repeated request id is not performed twice; of the caller with the most, the oldest is forgotten first.
     pub remembered_requests: usize,
-    /// Of those, answers to one caller: the caller's own oldest is forgotten first.
+    /// Of these, answers to one caller: the caller's own oldest is forgotten first.
     pub remembered_per_caller: usize,
-    /// And bytes of the answers to one caller, each with about 256 bytes besides its ids; the newest is kept whatever it has.
+    /// Bytes of the remembered answers to one caller, each counted with about 256 bytes besides its ids; the newest is kept whatever its size.
     pub remembered_bytes_per_caller: usize,
-    /// And for so long at the most, in milliseconds (forgotten when the next one is remembered).
+    /// Maximum time for which answers are remembered, in milliseconds (they are forgotten when the next one is remembered).
     pub remember_for_ms: u64,
-    /// Watch events kept for those who watch from an earlier revision.
+    /// Watch events kept for watches that begin at an earlier revision.
     pub history: usize,
 }
 

@@ -1,6 +1,6 @@
-//! Long reads, in parts: a request that reads much does so in several turns, and other requests have theirs in between.
+//! Long reads in parts: a request that reads much does so in several turns, with other requests in between.
 //!
-//! A part is bounded in what it looks at, not in what it finds. Of what changes between two parts, the new or the old may be seen.
+//! A part is limited in what it reads, not in what it finds. If something changes between two parts, the result may have the old or the new state.
 
 use crate::explain::Explanation;
 use crate::id::{SessionId, WaiterId};
@@ -11,29 +11,29 @@ use ratn_model::resource::{Quantity, Requirement};
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Bound;
 
-/// Looks for what a requirement can be met with: how much of it exists, and the first ids.
+/// Searches what a requirement matches: the amount that exists, and the first ids.
 #[derive(Debug, Clone)]
 pub struct Search {
     requirement: Requirement,
     units: Option<Quantity>,
     ids: BTreeSet<String>,
     most_ids: usize,
-    /// The last that was looked at.
+    /// The last resource read.
     at: Option<OfKinds>,
 }
 
 impl Search {
-    /// Nothing found yet; of the ids, the first so many in their order are kept.
+    /// An empty search, which keeps the first `most_ids` ids in order.
     pub fn new(requirement: Requirement, most_ids: usize) -> Search {
         Search { requirement, units: None, ids: BTreeSet::new(), most_ids, at: None }
     }
 
-    /// How much was found, held or not, what is consumed excluded.
+    /// The amount found, held or not, without what is consumed.
     pub fn units(&self) -> Quantity {
         self.units.unwrap_or_default()
     }
 
-    /// The first ids of what was found, in order.
+    /// The first ids found, in order.
     pub fn into_ids(self) -> Vec<String> {
         self.ids.into_iter().collect()
     }
@@ -50,29 +50,29 @@ impl Search {
     }
 }
 
-/// Counts how much of what a requirement selects each session provides.
+/// Counts for each session the amount that it provides of what a requirement selects.
 #[derive(Debug, Clone)]
 pub struct ProvidedCount {
     requirement: Requirement,
     of_sessions: BTreeMap<SessionId, Quantity>,
-    /// The last that was looked at.
+    /// The last resource read.
     at: Option<OfKinds>,
 }
 
 impl ProvidedCount {
-    /// Nothing counted yet.
+    /// An empty count.
     pub fn new(requirement: Requirement) -> ProvidedCount {
         ProvidedCount { requirement, of_sessions: BTreeMap::new(), at: None }
     }
 
-    /// How much a session provides, held or not.
+    /// The amount that a session provides, held or not.
     pub fn of(&self, session: &SessionId) -> Quantity {
         self.of_sessions.get(session).copied().unwrap_or_default()
     }
 }
 
 impl Pool {
-    /// Looks at so many more resources of the kinds at the most; how many that was, less where it has looked at all.
+    /// Reads at most `resources` more resources of the kinds; returns how many were read, fewer if none are left.
     pub fn count_provided(&self, count: &mut ProvidedCount, resources: usize) -> usize {
         let mut looked_at = 0;
         for (at, resource) in self.resources.all_of_after(&count.requirement.kind, count.at).take(resources) {
@@ -85,8 +85,8 @@ impl Pool {
         looked_at
     }
 
-    /// Looks at so many more resources of the kinds; whether it has looked at all. Of a kind without anything else all units are counted at
-    /// once, by the first call.
+    /// Reads at most `resources` more resources of the kinds; returns whether all have been read. If the requirement only names a kind, the first
+    /// call counts all units.
     pub fn go_on(&self, search: &mut Search, resources: usize) -> bool {
         let counted = self.resources.fits_every(&search.requirement);
         if search.units.is_none() {
@@ -107,8 +107,8 @@ impl Pool {
         looked_at < resources
     }
 
-    /// Why the first of these wait, as many as take so many looks at resources and waiters, and one at the least; and how many of them
-    /// that was, those included who do not wait any more.
+    /// Explains why the first of these waiters wait: as many as fit into `looks` reads of resources and waiters, and at least one. Also returns how
+    /// many waiters were processed, including those that do not wait any more.
     pub fn explain_some(&self, waiters: &[WaiterId], looks: usize) -> (Vec<Explanation>, usize) {
         let (mut explanations, mut looked_at, mut done) = (Vec::new(), 0, 0);
         for id in waiters {
@@ -125,8 +125,8 @@ impl Pool {
         (explanations, done)
     }
 
-    /// Sessions behind an id, in the order of ids; from the first one behind the empty id. As many as have so much beside them (leases,
-    /// waiters and resources) in all, and one at the least. Of the leases and resources of each so many are named at the most.
+    /// The sessions after an id, in the order of ids; an empty id is before the first. As many as have `most` entries (leases, waiters and resources)
+    /// in total, and at least one. At most `named` leases and resources of each are included.
     pub fn sessions_after(&self, id: &str, most: usize, named: usize) -> Vec<SessionView> {
         let behind = (Bound::Excluded(SessionId::from(id)), Bound::Unbounded);
         let mut seen = 0;
@@ -191,7 +191,7 @@ mod tests {
         let mut pool = pool();
         let mut search = Search::new(tools(Some(true)), 5);
         assert!(!pool.go_on(&mut search, 100));
-        // The last that was looked at is gone, and so is one that was not.
+        // The last resource read has been deleted, and so has one that was not read.
         for id in ["tool-099", "tool-201"] {
             pool.delete(NOW, None, id).unwrap();
         }

@@ -1,54 +1,54 @@
-//! The order of one session's own requests, and which of them compete with those of other sessions.
+//! The order of one session's own requests, and which of them compete with requests of other sessions.
 //!
 //! ```text
-//!   own order:   certain before speculative, then the larger priority, then who came first
-//!   first ones:  in own order, each that takes nothing of a family of which an earlier first one takes something
+//!   own order:   certain before speculative, then the larger priority, then the earlier arrival
+//!   first ones:  in own order, each that takes units of no family from which an earlier first one takes units
 //! ```
 //!
-//! So a request that waits behind another one in one family keeps none behind it from competing in another family. Of the requests that
-//! take something of the same families, only the earliest can be a first one: a look is as long as there are different sets of families.
+//! So a request that waits behind another one in one family does not keep later requests from competing in another family. Of the requests for the
+//! same set of families, only the earliest can be a first one: the computation is linear in the number of different sets of families.
 //!
-//! Requests that come and go in one turn take one look, in the end ([`OwnOrder::settle`]).
+//! Several requests that come and go in one turn cost one computation, at the end ([`OwnOrder::settle`]).
 
 use crate::id::WaiterId;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Where a request stands among those of its own session: what is certain, then the larger priority, then who came first.
+/// The place of a request among those of its session: certain first, then the larger priority, then the earlier arrival.
 pub(crate) type OwnPlace = (bool, Reverse<i64>, WaiterId);
 
-/// The families of which a request takes something.
+/// The families from which a request takes units.
 pub(crate) type Families = BTreeSet<Arc<str>>;
 
-/// The requests of one session that wait and for which what exists would do. Those that take nothing are not among them.
+/// The waiting requests of one session that existing resources could satisfy, without requests that take nothing.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct OwnOrder {
     waiting: BTreeMap<Families, BTreeSet<OwnPlace>>,
-    /// The first one of each family, as it was settled last.
+    /// The first one of each family, as of the last [`OwnOrder::settle`].
     first: BTreeMap<Arc<str>, OwnPlace>,
 }
 
-/// How the first requests of a session are others than before.
+/// How the first requests of a session have changed.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Settled {
-    /// They were first ones, and are not any more.
+    /// Requests that are no longer first ones.
     pub(crate) no_more: Vec<WaiterId>,
-    /// They are first ones from now on, in own order.
+    /// Requests that have become first ones, in own order.
     pub(crate) anew: Vec<WaiterId>,
-    /// At so many requests and families was looked.
+    /// Number of requests and families that were read.
     pub(crate) looked_at: usize,
 }
 
 impl OwnOrder {
-    /// One waits; whether it is to be settled.
+    /// Adds a waiting request; returns whether `settle` is needed.
     pub(crate) fn insert(&mut self, families: Families, own: OwnPlace) -> bool {
         let same = self.waiting.entry(families).or_default();
         same.insert(own);
         same.first() == Some(&own)
     }
 
-    /// One does not wait any more; whether it is to be settled.
+    /// Removes a waiting request; returns whether `settle` is needed.
     pub(crate) fn remove(&mut self, families: &Families, own: &OwnPlace) -> bool {
         let Some(same) = self.waiting.get_mut(families) else { return false };
         let was_earliest = same.first() == Some(own);
@@ -59,17 +59,17 @@ impl OwnOrder {
         was_earliest
     }
 
-    /// Whether a request of these families is a first one, or would be if it waited.
+    /// Whether a request for these families is a first one, or would be if it waited.
     pub(crate) fn is_first<'a>(&self, families: impl IntoIterator<Item = &'a str>, own: &OwnPlace) -> bool {
         families.into_iter().all(|family| self.first.get(family).is_none_or(|first| own <= first))
     }
 
-    /// The first one of a family.
+    /// The first request for a family.
     pub(crate) fn first_of(&self, family: &str) -> Option<WaiterId> {
         self.first.get(family).map(|own| own.2)
     }
 
-    /// Finds the first ones anew.
+    /// Determines the first requests anew.
     pub(crate) fn settle(&mut self) -> Settled {
         let earliest = self.waiting.iter().filter_map(|(families, same)| Some((*same.first()?, families)));
         let mut earliest: Vec<(OwnPlace, &Families)> = earliest.collect();

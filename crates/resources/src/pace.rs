@@ -1,9 +1,9 @@
-//! The pace at which tokens grow: no faster than a clock's microseconds, so that the time is above all that was ever handed out.
+//! Limits how fast tokens grow: at most one per microsecond, so that a clock's microseconds are larger than every token handed out.
 //!
 //! ```text
-//!   started at floor t ──▶ last token ≤ t + AHEAD + microseconds since ──▶ state lost, started anew at floor t' > all of them
+//!   started at floor t ──▶ last token ≤ t + AHEAD + microseconds since ──▶ state lost, restarted at floor t' > all of them
 //! ```
-//! More grants than one a microsecond are made a little later. A process takes longer to be started than [`AHEAD`] microseconds.
+//! Grants beyond one per microsecond are made a little later. Starting a process takes longer than [`AHEAD`] microseconds.
 
 use crate::caller::for_all;
 use crate::pool::Pool;
@@ -11,16 +11,16 @@ use crate::session::Session;
 use ratn_model::time::Timestamp;
 use std::time::Duration;
 
-/// Tokens that may be handed out before any time has passed.
+/// Number of tokens that may be handed out before any time has passed.
 const AHEAD: u64 = 1_000;
-/// When it is looked again whether time has caught up.
+/// When to check again whether time has caught up.
 const A_WHILE: Duration = Duration::from_micros(10);
 
 /// See the module.
 #[derive(Debug, Clone)]
 pub(crate) struct Pace {
     from: u64,
-    /// When that was so: the first moment that the pool hears of.
+    /// The time of `from`: the first time that the pool was told.
     at: Option<Timestamp>,
 }
 
@@ -45,19 +45,19 @@ impl Pool {
         self.leases.len() + self.ending.len() < self.limits.leases && !self.is_ahead_of_time()
     }
 
-    /// The same of one for a session: of all leases some are only for operators.
+    /// The same for a session: some of all leases are reserved for operators.
     pub(crate) fn may_grant_to(&self, session: &Session) -> bool {
         let for_all = for_all(self.limits.leases, self.limits.leases_for_operators);
         self.may_grant() && (session.is_operators() || self.leases.len() + self.ending.len() < for_all)
     }
 
-    /// Whether the next token would be ahead of the time.
+    /// Whether the next token would be ahead of time.
     pub(crate) fn is_ahead_of_time(&self) -> bool {
         let next = self.last_token.max(self.last_lease) + 1;
         self.pace.as_ref().is_some_and(|pace| !pace.allows(next, self.now))
     }
 
-    /// When somebody who could be served is to be looked at again because tokens were ahead of the time.
+    /// When waiters that could be served are examined again, because tokens were ahead of time.
     pub(crate) fn served_later(&self) -> Option<Timestamp> {
         (!self.queue.ready.is_empty() && self.is_ahead_of_time()).then(|| self.now + A_WHILE)
     }

@@ -1,4 +1,4 @@
-//! The queue of acquires, in the order of their turns; and what each waiter has reserved.
+//! The queue of acquires, in the order of their turns, and the reservations of each waiter.
 
 use crate::assignment::grain;
 use crate::changed::Touched;
@@ -16,26 +16,26 @@ use std::ops::Bound;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// What an acquire asks for: all of it, or to wait.
+/// What an acquire asks for; it gets all of it, or waits.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AcquireRequest {
-    /// Who asks; the lease ends with this session.
+    /// The session that asks; the lease ends with it.
     pub session: SessionId,
-    /// Blocks, consumes and exists.
+    /// Block, consume and exist requirements.
     pub requirements: Vec<Requirement>,
-    /// Larger first, of what was asked at about the same time by sessions with about their shares: see `turn.rs`. The bits from 2^60 on are
+    /// Larger is served first, among requests from about the same time by sessions with about their shares: see `turn.rs`. The bits from 2^60 on are
     /// the urgency, which comes before due times.
     pub priority: i64,
     /// When to give up; `None` waits as long as the session lives.
     pub deadline: Option<Timestamp>,
-    /// For how long the lease may be held at most; `None` is as long as the session lives.
+    /// Maximum holding time of the lease; `None` for as long as the session lives.
     pub hold_for: Option<Duration>,
-    /// Whom or what it is for, in explanations and events (a run's instance); may be empty.
+    /// The purpose, in explanations and events (a run's instance); may be empty.
     pub purpose: String,
-    /// It may turn out not to be needed: all that is needed for certain comes first.
+    /// Speculative: it may turn out not to be needed. Everything that is certainly needed comes first.
     #[serde(default, skip_serializing_if = "is_false")]
     pub speculative: bool,
-    /// The id of an earlier request of the session for the same, whose place it takes; empty for none.
+    /// The id of an earlier request of the session for the same, which this one replaces; empty for none.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub instead_of: String,
 }
@@ -44,7 +44,7 @@ fn is_false(value: &bool) -> bool {
     !value
 }
 
-/// Where a waiter stands: it is served before those with a larger place.
+/// The place of a waiter: smaller places are served first.
 pub(crate) type Place = (Turn, WaiterId);
 
 /// A queued acquire.
@@ -52,69 +52,69 @@ pub(crate) type Place = (Turn, WaiterId);
 pub(crate) struct Waiter {
     pub(crate) request: AcquireRequest,
     pub(crate) turn: Turn,
-    /// Since when it or what it replaces waits.
+    /// Since when it, or the request that it replaces, has waited.
     pub(crate) asked: Timestamp,
-    /// The same, by the count of turns: only while what exists would do.
+    /// The same as counted for turns: only while existing resources could satisfy it.
     pub(crate) since: Timestamp,
-    /// Since when the one waited that it replaces, as long as what exists would do.
+    /// Since when the replaced request had waited, while existing resources can satisfy this one.
     pub(crate) kept: Option<Timestamp>,
-    /// Whether it is one of the first requests of its session (`own_order.rs`), of those for which what exists would do.
+    /// Whether it is one of the first requests of its session (`own_order.rs`), among those that existing resources could satisfy.
     pub(crate) first: bool,
-    /// Forgotten again when it leaves without a lease, so that the client can ask once more.
+    /// The request id, forgotten if the waiter leaves without a lease, so that the client can ask again.
     pub(crate) request_id: RequestId,
-    /// Per requirement, the group that it waits in.
+    /// For each requirement, the group in which it waits.
     pub(crate) groups: Vec<Key>,
-    /// Whether what exists would do if nobody held any of it. Only then it reserves.
+    /// Whether existing resources would satisfy it if nobody held any. Only then it reserves.
     pub(crate) hopeful: bool,
-    /// Since when that is so.
+    /// Since when it has been hopeful.
     pub(crate) hopeful_since: Timestamp,
-    /// Per requirement, what it has reserved: free, and for nobody else.
+    /// For each requirement, the reserved units: free, and for nobody else.
     pub(crate) reserved: Vec<Units>,
-    /// The families of which it lacks something.
+    /// The families of which it lacks units.
     pub(crate) lacks: BTreeSet<Arc<str>>,
-    /// How many times a later one was served with what this one waits for.
+    /// How often a later waiter was served with what this one waits for.
     pub(crate) overtaken: u32,
-    /// Per requirement, what was missing when what exists would last not have done.
+    /// For each requirement, the amount that was missing when it was last found not to be hopeful.
     pub(crate) missing: Vec<Quantity>,
 }
 
-/// Waiters in the order in which they are served, and by what they wait for.
+/// Waiters in serving order, and indexed by what they wait for.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Queue {
     pub(crate) waiters: BTreeMap<WaiterId, Waiter>,
     pub(crate) order: BTreeSet<Place>,
     pub(crate) groups: BTreeMap<Key, Group>,
     pub(crate) families: BTreeMap<Arc<str>, Family>,
-    /// What all waiters together have reserved.
+    /// The reservations of all waiters together.
     pub(crate) reserved: Units,
-    /// Those that lack nothing.
+    /// Waiters that lack nothing.
     pub(crate) ready: BTreeSet<Place>,
-    /// Resources that changed, of which the groups of their family do not know yet.
+    /// Changed resources that the groups of their family do not know yet.
     pub(crate) touched: Touched,
-    /// Families in which something became free; true where what is reserved has to be shared out anew.
+    /// Families in which something became free; true if reservations have to be shared out anew.
     pub(crate) changed: BTreeMap<Arc<str>, bool>,
-    /// The family that was shared out last: the one behind it is next, so that each has its turn.
+    /// The family that was shared out last; the one after it is next, so that families take turns.
     pub(crate) shared: Option<Arc<str>>,
-    /// Where sharing out was interrupted in a family: those behind are still to be looked at.
+    /// Where sharing out was interrupted in a family: later waiters have not been examined.
     pub(crate) shared_until: BTreeMap<Arc<str>, Place>,
-    /// Those of whom it is to be found out anew whether what exists would do.
+    /// Waiters whose hopefulness has to be re-examined.
     doubtful: BTreeSet<Place>,
-    /// The last of them that was looked at, while there are more: the one behind it is next, so that each has its turn.
+    /// The last of these that was examined, while there are more; the one after it is next, so that waiters take turns.
     doubted: Option<Place>,
-    /// Those of whom it would not.
+    /// Waiters that are not hopeful.
     pub(crate) hopeless: BTreeSet<Place>,
-    /// What they lack may be something else.
+    /// Whether the demand may have changed.
     pub(crate) demand_changed: bool,
-    /// What of that somebody wants to know.
+    /// The kinds whose demand is of interest to providers.
     pub(crate) provided: Arc<Provided>,
     /// What is waited for although it exists.
     pub(crate) growth: Growth,
-    /// Whether somebody could be served for whom a turn had no time left.
+    /// Whether a turn had no time left to serve a waiter.
     pub(crate) unserved: bool,
 }
 
 impl AcquireRequest {
-    /// Without priority, deadline or bound on holding.
+    /// Without priority, deadline or maximum holding time.
     pub fn new(session: SessionId, requirements: Vec<Requirement>) -> AcquireRequest {
         let (priority, deadline, hold_for, purpose, speculative, instead_of) = Default::default();
         AcquireRequest { session, requirements, priority, deadline, hold_for, purpose, speculative, instead_of }
@@ -140,12 +140,12 @@ impl Waiter {
         (self.turn, id)
     }
 
-    /// What was missing of a group when what exists would last not have done.
+    /// The amount of a group that was missing when the waiter was last found not to be hopeful.
     pub(crate) fn missing_of(&self, key: &Key) -> Quantity {
         self.groups.iter().zip(&self.missing).filter(|(other, _)| *other == key).map(|(_, amount)| *amount).sum()
     }
 
-    /// What of a group it wants and has not reserved. Parts of a unit are none of what is wanted in whole ones.
+    /// The amount of a group that it wants and has not reserved. Fractions do not count for requirements in whole units.
     pub(crate) fn lacks_of(&self, key: &Key) -> Quantity {
         let wanted = self.request.requirements.iter().zip(&self.reserved).zip(&self.groups);
         let of_group = wanted.filter(|(_, other)| *other == key).map(|(wanted, _)| wanted);
@@ -166,7 +166,7 @@ impl Queue {
         self.waiters.get(&id)
     }
 
-    /// In the order in which they are served.
+    /// The waiters in serving order.
     pub(crate) fn iter(&self) -> impl Iterator<Item = (WaiterId, &Waiter)> {
         self.order.iter().filter_map(|(_, id)| self.waiters.get(id).map(|waiter| (*id, waiter)))
     }
@@ -180,18 +180,19 @@ impl Queue {
         }
     }
 
-    /// Whether something was put off to later turns.
+    /// Whether work was postponed to later turns.
     pub(crate) fn is_behind(&self) -> bool {
         self.unserved || !(self.touched.is_empty() && self.changed.is_empty() && self.doubtful.is_empty())
     }
 
-    /// The same of what may concern those who want something of a family.
+    /// The same for work that may concern waiters of a family.
     pub(crate) fn is_behind_in(&self, family: &str) -> bool {
         let in_doubt = self.families.get(family).is_some_and(|family| family.doubtful > 0);
         in_doubt || self.touched.is_in(family) || self.changed.contains_key(family)
     }
 
-    /// Whether what a waiter has reserved is free, and all else that it asks for is there. Where much has changed, that is known later.
+    /// Whether the reservations of a waiter are still free, and everything else that it asks for exists. While changes are not settled, this is
+    /// unknown (false).
     pub(crate) fn is_certain(&self, place: Place) -> bool {
         let Some(waiter) = self.waiters.get(&place.1) else { return false };
         let settled = |family: &str| !self.touched.is_in(family) && self.changed.get(family) != Some(&true);
@@ -199,14 +200,14 @@ impl Queue {
         !self.doubtful.contains(&place) && families.into_iter().all(settled)
     }
 
-    /// Of this one it is to be found out anew whether what exists would do.
+    /// The hopefulness of this waiter has to be re-examined.
     pub(crate) fn doubt(&mut self, place: Place) {
         if self.doubtful.insert(place) {
             self.count_doubt(place, |doubtful| *doubtful += 1);
         }
     }
 
-    /// It is known, or does not matter any more.
+    /// It has been re-examined, or does not matter any more.
     pub(crate) fn doubt_no_more(&mut self, place: Place) {
         if self.doubtful.remove(&place) {
             self.count_doubt(place, |doubtful| *doubtful -= 1);
@@ -220,7 +221,7 @@ impl Queue {
         }
     }
 
-    /// The next of whom it is to be found out whether what exists would do.
+    /// The next waiter whose hopefulness has to be re-examined.
     pub(crate) fn next_doubtful(&mut self) -> Option<Place> {
         let behind = self.doubted.map_or(Bound::Unbounded, Bound::Excluded);
         let next = self.doubtful.range((behind, Bound::Unbounded)).next().or_else(|| self.doubtful.first()).copied()?;
@@ -229,8 +230,8 @@ impl Queue {
         Some(next)
     }
 
-    /// Whether what exists would do for this one is known; whether that is otherwise than before. Of whoever is hopeless, its groups learn
-    /// whether something of them is missing.
+    /// Records whether existing resources could satisfy this waiter; returns whether that has changed. The groups of a hopeless waiter learn whether
+    /// units of them are missing.
     pub(crate) fn set_hopeless(&mut self, place: Place, hopeless: bool) -> bool {
         let changed = if hopeless { self.hopeless.insert(place) } else { self.hopeless.remove(&place) };
         if !hopeless && !changed {
@@ -253,7 +254,7 @@ impl Queue {
         self.shared_until.remove(family);
     }
 
-    /// A waiter has another turn. What others had reserved may be its own now, or the other way.
+    /// Gives a waiter another turn. Reservations may have to move between it and others.
     pub(crate) fn move_to(&mut self, id: WaiterId, turn: Turn) {
         let Some(waiter) = self.waiters.get_mut(&id) else { return };
         let (from, to) = (waiter.place(id), (turn, id));
@@ -288,7 +289,7 @@ impl Queue {
         disturbed.iter().for_each(|(name, disturbs)| self.mark(name, *disturbs));
     }
 
-    /// Whether the indices say the same as the waiters do.
+    /// Whether the indices match the waiters.
     pub(crate) fn index_agrees(&self) -> Result<(), String> {
         let ensure = |holds: bool, what: &str| if holds { Ok(()) } else { Err(what.to_owned()) };
         ensure(self.order.len() == self.waiters.len(), "the order of the queue has another length")?;

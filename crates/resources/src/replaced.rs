@@ -1,12 +1,11 @@
-//! Requests that take the place of others: asked again after a broken connection, with another priority, or for certain.
+//! Requests that replace others: repeated after a broken connection, with another priority, or made certain.
 //!
-//! Such a request keeps the time since which the other one waited, where that is of the same session, waits still, or has left without a
-//! lease a moment ago, and wanted the same of what would have done for it. So nobody gains by leaving and coming back, nor loses, nor saves up
-//! time with a request that cannot be served. Each time is kept once: two requests do not share it.
+//! Such a request keeps the waiting time of the other one if that belongs to the same session, still waits or has left without a lease a moment ago,
+//! and wanted the same, which existing resources could satisfy. So nobody gains or loses by leaving and returning, or saves up time with a request
+//! that cannot be served. Each waiting time is kept once: two requests do not share it.
 //!
-//! No time is kept from before the last request was served that was the first of the session there. Accounts (`accounts.rs`) may forget when
-//! that was: of a session that has ended, and of one that is where anybody begins. Here it is known for as long as a request is that has left
-//! before.
+//! No waiting time is kept from before the last service of a first request of the session in these families. Accounts (`accounts.rs`) may forget when
+//! that was, for a session that has ended or whose account equals a new one. Here it is remembered as long as any request that left before it.
 
 use crate::group::Key;
 use crate::id::SessionId;
@@ -17,14 +16,14 @@ use ratn_model::time::Timestamp;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// So many of one caller that have left are known at the most; its own oldest is forgotten first.
+/// Maximum number of requests remembered per caller; its own oldest is forgotten first.
 const OF_CALLER: usize = 4_096;
 
-/// What a request was that waited.
+/// A request that waited earlier.
 #[derive(Debug, Clone)]
 pub(crate) struct Earlier {
     pub(crate) session: SessionId,
-    /// Since when it waited; nothing where what exists would not have done for it.
+    /// Since when it waited; `None` if existing resources could not satisfy it.
     pub(crate) kept: Option<Timestamp>,
     pub(crate) speculative: bool,
     /// What it wanted.
@@ -35,21 +34,21 @@ pub(crate) struct Earlier {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Left {
     callers: BTreeMap<Arc<str>, OfCaller>,
-    /// When the last first request of a session was served in a family, where that was a moment ago.
+    /// When a first request of a session was last served in a family, if recently.
     served: BTreeMap<(SessionId, Arc<str>), Timestamp>,
-    /// When what is old was forgotten.
+    /// When old entries were last removed.
     forgotten: Timestamp,
 }
 
 #[derive(Debug, Clone, Default)]
 struct OfCaller {
     requests: BTreeMap<Arc<str>, (Timestamp, Earlier)>,
-    /// The oldest first; of some nothing is known any more.
+    /// Oldest first; some of these requests are no longer remembered.
     order: VecDeque<(Timestamp, Arc<str>)>,
 }
 
 impl Earlier {
-    /// Since when a request has waited that takes its place now.
+    /// Since when a request counts as waiting that replaces this one now.
     pub(crate) fn kept_by(&self, now: Timestamp, speculative: bool, groups: &[Key]) -> Option<Timestamp> {
         let kept = self.kept.filter(|_| self.groups == groups)?;
         if !self.speculative || speculative {
@@ -72,7 +71,7 @@ impl OfCaller {
 }
 
 impl Left {
-    /// One leaves.
+    /// A request leaves the queue.
     pub(crate) fn leaves(&mut self, now: Timestamp, id: RequestId, earlier: Earlier) {
         if id.is_empty() {
             return;
@@ -83,7 +82,7 @@ impl Left {
         of_caller.forget_old(now);
     }
 
-    /// What is known of one of a session that has left no longer ago than a moment. It is not told twice.
+    /// Takes what is remembered about a request of a session that left recently. It is returned only once.
     pub(crate) fn take(&mut self, now: Timestamp, id: &RequestId, session: &SessionId) -> Option<Earlier> {
         let requests = &mut self.callers.get_mut(&id.caller)?.requests;
         requests.get(&id.id).filter(|(_, earlier)| earlier.session == *session)?;
@@ -91,9 +90,9 @@ impl Left {
         (left + LEAD >= now).then_some(earlier)
     }
 
-    /// The first request of a session in some families is served.
+    /// The first request of a session in these families is served.
     pub(crate) fn first_was_served(&mut self, now: Timestamp, session: &SessionId, families: &Families) {
-        // What leaves from now on knows it by itself.
+        // Requests that leave later have this time themselves.
         if self.callers.is_empty() {
             return;
         }
@@ -102,7 +101,7 @@ impl Left {
         }
     }
 
-    /// When that was last; of long ago nothing is known.
+    /// When that was last; 0 if it was long ago.
     pub(crate) fn served(&self, session: &SessionId, family: &str) -> Timestamp {
         if self.served.is_empty() {
             return Timestamp(0);
@@ -110,7 +109,7 @@ impl Left {
         self.served.get(&(session.clone(), Arc::from(family))).copied().unwrap_or(Timestamp(0))
     }
 
-    /// What is old is forgotten, now and then.
+    /// Removes old entries from time to time.
     pub(crate) fn forget(&mut self, now: Timestamp) {
         if self.forgotten + LEAD >= now {
             return;

@@ -1,4 +1,4 @@
-//! A resource: its description, how much each lease holds, and therefore what is free.
+//! A resource: its description, the holdings of leases, and hence what is free.
 
 use crate::crowd::Holders;
 use crate::id::{SessionId, Slot};
@@ -13,39 +13,39 @@ use std::ops::Deref;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The attribute that says where a resource's action service is.
+/// The attribute with the endpoint of a resource's action service.
 pub const ENDPOINT_ATTRIBUTE: &str = "endpoint";
 
-/// The attribute by which a provider asks for time to stop what moves, in whole milliseconds: when a lease of the resource ends
-/// otherwise than by its holder's release, its units stay taken until the provider has confirmed standstill
-/// ([`crate::Pool::confirm_standstill`]), and no longer than this. Without it, or with 0, they are free at once.
+/// The attribute by which a provider asks for time to stop what moves, in whole milliseconds: when a lease of the resource does not end by its
+/// holder's release, its units stay taken until the provider has confirmed standstill ([`crate::Pool::confirm_standstill`]), at most for this time.
+/// Without the attribute, or with 0, they are free at once.
 pub const STANDSTILL_ATTRIBUTE: &str = "standstill_ms";
 
-/// The longest [`STANDSTILL_ATTRIBUTE`], in milliseconds.
+/// The maximum of [`STANDSTILL_ATTRIBUTE`], in milliseconds.
 pub const LONGEST_STANDSTILL_MS: u64 = 60_000;
 
-/// What a create asks for.
+/// The description in a create request.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ResourceSpec {
-    /// Its id; `None` lets the pool number it, `box_delivered-3`.
+    /// Its id; with `None` the pool numbers it: `box_delivered-3`.
     pub id: Option<String>,
     /// Its class.
     pub class: ResourceClass,
-    /// Its kind, `PathPlanner`.
+    /// Its kind, for example `PathPlanner`.
     pub kind: String,
-    /// Attributes; `endpoint` says where its action service is.
+    /// Attributes; `endpoint` is the endpoint of its action service.
     pub attributes: BTreeMap<String, Value>,
-    /// How much of it there is: how many units may be held at once.
+    /// The capacity: the number of units that may be held at the same time.
     pub capacity: Quantity,
-    /// Whether parts of a unit can be had (battery charge), not only whole ones.
+    /// Whether fractions of a unit can be held (battery charge), not only whole units.
     pub divisible: bool,
-    /// Whether what a task consumed returns when the task ends.
+    /// Whether units that a task consumed return when the task ends.
     pub renewable: bool,
-    /// The host that it is on; may be empty.
+    /// The host on which it is; may be empty.
     pub host: String,
 }
 
-/// What a resource is; shared by everybody who looks at it.
+/// The description of a resource; shared by all views.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Description {
     /// Its id.
@@ -56,34 +56,34 @@ pub struct Description {
     pub kind: String,
     /// Its attributes.
     pub attributes: Attributes,
-    /// How much of it there is in all, what is consumed included.
+    /// The total amount, including what is consumed.
     pub capacity: Quantity,
-    /// Whether parts of a unit can be had.
+    /// Whether fractions of a unit can be held.
     pub divisible: bool,
-    /// Whether what a task consumed returns when the task ends.
+    /// Whether units that a task consumed return when the task ends.
     pub renewable: bool,
-    /// The host that it is on; may be empty.
+    /// The host on which it is; may be empty.
     pub host: String,
 }
 
-/// Attributes by name, in order; as small as they can be.
+/// Attributes by name, in order, in compact form.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Attributes(Box<[(Box<str>, Value)]>);
 
-/// A resource as others see it: its description (by `Deref`) and what is going on with it.
+/// A resource as others see it: its description (by `Deref`) and its present state.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ResourceView {
-    /// What it is.
+    /// Its description.
     pub description: Arc<Description>,
-    /// What nobody holds and nobody has consumed.
+    /// The amount that is neither held nor consumed.
     pub free: Quantity,
-    /// What is consumed.
+    /// The amount that is consumed.
     pub consumed: Quantity,
-    /// The session with which it vanishes.
+    /// The session that provides it; the resource is deleted with it.
     pub owner: Option<SessionId>,
-    /// Who holds some of it, and what is neither held nor free yet.
+    /// The holders, and units that are neither held nor free yet.
     pub holders: Holders,
-    /// The pool's revision when it was created or updated.
+    /// The pool's revision at which it was created or updated.
     pub revision: Revision,
 }
 
@@ -94,43 +94,42 @@ pub struct Holding {
     pub lease: LeaseId,
     /// Its fencing token.
     pub token: FencingToken,
-    /// Whose lease.
+    /// The holder.
     pub session: SessionId,
-    /// Who opened that session, as its connection proved; empty where nobody knows.
+    /// The caller who opened that session, as its connection proved; empty if unknown.
     pub opened_by: Arc<str>,
-    /// How much.
+    /// The amount.
     pub units: Quantity,
-    /// What the lease is for.
+    /// The purpose of the lease.
     pub purpose: Arc<str>,
 }
 
-/// An amount of a resource whose lease has ended, while something may still move for it.
+/// An amount of a resource whose lease has ended, while something may still move for that lease.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EndingUnits {
     /// The lease that has ended.
     pub lease: LeaseId,
     /// Its fencing token.
     pub token: FencingToken,
-    /// Whose lease it was.
+    /// The former holder.
     pub session: SessionId,
-    /// How much.
+    /// The amount.
     pub units: Quantity,
-    /// They are free after this time, whatever the provider says until then.
+    /// The units are free after this time, whatever the provider reports until then.
     pub within: Duration,
 }
 
-/// A resource in the pool. `holders` is what the live leases hold of it and what leases that end have left, and there is no other
-/// count of what is taken.
+/// A resource in the pool. `holders` lists what live leases hold of it and what ended leases have left; taken units are not counted anywhere else.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Resource {
     pub(crate) description: Arc<Description>,
     pub(crate) owner: Option<SessionId>,
     pub(crate) revision: Revision,
-    /// In the order of leases, those that end included.
+    /// Ordered by lease, ended ones included.
     pub(crate) holders: Vec<(LeaseId, Quantity)>,
-    /// What sessions have consumed of it until their task ends, in the order of sessions.
+    /// What sessions have consumed of it until their tasks end, ordered by session.
     pub(crate) consumers: Vec<(SessionId, Quantity)>,
-    /// What was consumed for good.
+    /// What was consumed permanently.
     pub(crate) spent: Quantity,
 }
 
@@ -149,49 +148,49 @@ impl ResourceSpec {
         }
     }
 
-    /// With this id.
+    /// Sets the id.
     #[must_use]
     pub fn id(mut self, id: impl Into<String>) -> ResourceSpec {
         self.id = Some(id.into());
         self
     }
 
-    /// With so much of it.
+    /// Sets the capacity.
     #[must_use]
     pub fn capacity(mut self, capacity: impl Into<Quantity>) -> ResourceSpec {
         self.capacity = capacity.into();
         self
     }
 
-    /// Whose provider needs up to this time to stop what moves, in whole milliseconds.
+    /// Sets the maximum time that its provider needs to stop what moves, in whole milliseconds.
     #[must_use]
     pub fn standstill(self, bound: Duration) -> ResourceSpec {
         let bound = i64::try_from(bound.as_millis()).unwrap_or(i64::MAX);
         self.attribute(STANDSTILL_ATTRIBUTE, Value::Int(bound))
     }
 
-    /// Of which parts of a unit can be had.
+    /// Allows fractions of a unit.
     #[must_use]
     pub fn divisible(mut self) -> ResourceSpec {
         self.divisible = true;
         self
     }
 
-    /// Of which what is consumed is gone for good.
+    /// Makes consumption permanent.
     #[must_use]
     pub fn non_renewable(mut self) -> ResourceSpec {
         self.renewable = false;
         self
     }
 
-    /// On this host.
+    /// Sets the host.
     #[must_use]
     pub fn host(mut self, host: impl Into<String>) -> ResourceSpec {
         self.host = host.into();
         self
     }
 
-    /// With this attribute.
+    /// Adds an attribute.
     #[must_use]
     pub fn attribute(mut self, name: impl Into<String>, value: Value) -> ResourceSpec {
         self.attributes.insert(name.into(), value);
@@ -219,7 +218,7 @@ impl Attributes {
         self.0.binary_search_by(|(known, _)| (**known).cmp(name)).ok().map(|at| &self.0[at].1)
     }
 
-    /// In the order of names.
+    /// All attributes, ordered by name.
     pub fn iter(&self) -> impl ExactSizeIterator<Item = (&str, &Value)> {
         self.0.iter().map(|(name, value)| (&**name, value))
     }
@@ -234,17 +233,17 @@ impl Deref for ResourceView {
 }
 
 impl Description {
-    /// Whether a requirement can be met with it, if it is of the right kind.
+    /// Whether it matches a requirement, if it is of the right kind.
     pub(crate) fn fits(&self, requirement: &Requirement) -> bool {
         requirement.class.is_none_or(|class| class == self.class) && requirement.accepts(|name| self.attribute(name))
     }
 
-    /// Whether its attributes are like this.
+    /// Whether its attributes meet a condition.
     pub fn meets(&self, condition: &Condition) -> bool {
         self.attribute(&condition.attribute).is_some_and(|value| condition.holds(&value))
     }
 
-    /// An attribute; `host` is where it is, unless it says so itself.
+    /// An attribute; `host` defaults to the resource's host.
     pub(crate) fn attribute(&self, name: &str) -> Option<Cow<'_, Value>> {
         let host = || (name == "host" && !self.host.is_empty()).then(|| Cow::Owned(Value::String(self.host.clone())));
         self.attributes.get(name).map(Cow::Borrowed).or_else(host)
@@ -277,13 +276,13 @@ impl Resource {
         self.spent + self.consumers.iter().map(|(_, amount)| *amount).sum()
     }
 
-    /// What a session has consumed of it that returns.
+    /// What a session has consumed of it that will return.
     pub(crate) fn consumed_by(&self, session: &SessionId) -> Quantity {
         let found = self.consumers.binary_search_by(|(other, _)| other.cmp(session));
         found.map_or(Quantity::ZERO, |at| self.consumers[at].1)
     }
 
-    /// What exists and is not consumed, held or not.
+    /// The amount that exists and is not consumed, held or not.
     pub(crate) fn quantity(&self) -> Quantity {
         self.description.capacity.saturating_sub(self.consumed())
     }
@@ -292,7 +291,7 @@ impl Resource {
         self.holders.iter().map(|(_, amount)| *amount).sum()
     }
 
-    /// What can be given away now.
+    /// The amount that can be given away now.
     pub(crate) fn free(&self) -> Quantity {
         self.quantity().saturating_sub(self.held())
     }
@@ -309,7 +308,7 @@ impl Resource {
     }
 }
 
-/// Adds to an amount in a list that is ordered by its keys.
+/// Adds to an amount in a list ordered by key.
 pub(crate) fn add_to<K: Ord + Clone>(amounts: &mut Vec<(K, Quantity)>, key: &K, amount: Quantity) {
     match amounts.binary_search_by(|(other, _)| other.cmp(key)) {
         Ok(at) => amounts[at].1 += amount,
@@ -322,7 +321,7 @@ pub(crate) fn add_to<K: Ord + Clone>(amounts: &mut Vec<(K, Quantity)>, key: &K, 
     }
 }
 
-/// Takes some out of an amount in such a list; whether anything is left of it.
+/// Subtracts from an amount in such a list; returns whether anything is left.
 pub(crate) fn take_from<K: Ord>(amounts: &mut Vec<(K, Quantity)>, key: &K, amount: Quantity) -> bool {
     let Ok(at) = amounts.binary_search_by(|(other, _)| other.cmp(key)) else { return false };
     amounts[at].1 = amounts[at].1.saturating_sub(amount);
@@ -333,11 +332,11 @@ pub(crate) fn take_from<K: Ord>(amounts: &mut Vec<(K, Quantity)>, key: &K, amoun
     left
 }
 
-/// Takes an amount out of such a list, whole.
+/// Removes a whole amount from such a list.
 pub(crate) fn remove_from<K: Ord>(amounts: &mut Vec<(K, Quantity)>, key: &K) -> Option<Quantity> {
     let at = amounts.binary_search_by(|(other, _)| other.cmp(key)).ok()?;
     Some(amounts.remove(at).1)
 }
 
-/// By slot, which is what everything else in the pool names them by.
+/// Amounts by slot, the name of a resource within the pool.
 pub(crate) type Units = BTreeMap<Slot, Quantity>;

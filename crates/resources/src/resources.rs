@@ -1,7 +1,7 @@
-//! Every resource by its slot, and what finds them: by id, by kind, the free ones of a kind.
+//! All resources by slot, and the indices that find them: by id, by kind, and the free ones of a kind.
 //!
-//! A slot is a small number that a resource keeps for its life; the lowest vacant one is given next, so the same history
-//! gives the same slots. Every change of a resource goes through [`Resources::change`], which keeps the indices right.
+//! A slot is a small number that a resource keeps for its life; the lowest vacant one is used next, so the same history gives the same slots. Every
+//! change of a resource goes through [`Resources::change`], which updates the indices.
 
 use crate::id::{SessionId, Slot};
 use crate::kinds::Kinds;
@@ -14,9 +14,9 @@ use std::ops::Bound;
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Resources {
     kinds: Kinds,
-    /// More leases than these do not hold some of one resource; none where nothing is said.
+    /// Maximum number of leases that may hold units of one resource; `None` for no limit.
     max_holders: Option<usize>,
-    /// Sessions that end: what they provide is given to nobody any more.
+    /// Ending sessions: what they provide is no longer given to anybody.
     closing: BTreeSet<SessionId>,
     slots: Vec<Option<Resource>>,
     vacant: BTreeSet<Slot>,
@@ -24,7 +24,7 @@ pub(crate) struct Resources {
     by_kind: BTreeMap<Box<str>, OfKind>,
 }
 
-/// A place among the resources of a kind and of those below it: which of the kinds, and which resource.
+/// A position among the resources of a kind and its subclasses: the index of the kind, and the slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct OfKinds {
     kind: usize,
@@ -35,11 +35,11 @@ pub(crate) struct OfKinds {
 #[derive(Debug, Clone, Default)]
 struct OfKind {
     all: BTreeSet<Slot>,
-    /// Those of which something is free, in the order in which they are given away: first what is like few others ask for.
+    /// The free ones, in the order in which they are given away: first those that match few other requests.
     free: BTreeSet<(usize, Slot)>,
-    /// How much of them there is, held or not.
+    /// The amount that exists, held or not.
     quantity: Quantity,
-    /// How many of them are divisible.
+    /// The number of divisible ones.
     divisible: usize,
 }
 
@@ -56,22 +56,22 @@ impl Resources {
         self.max_holders = Some(holders);
     }
 
-    /// What a session provides is given to nobody any more.
+    /// No longer gives what this session provides to anybody.
     pub(crate) fn close(&mut self, provider: &SessionId) {
         self.closing.insert(provider.clone());
     }
 
-    /// Nothing of a session is left.
+    /// The session has been removed completely.
     pub(crate) fn closed(&mut self, provider: &SessionId) {
         self.closing.remove(provider);
     }
 
-    /// Whether nobody can have more of a resource: as many leases hold some of it as may, or its provider ends.
+    /// Whether nobody can get more of a resource: the maximum number of leases hold it, or its provider is ending.
     pub(crate) fn is_kept_back(&self, resource: &Resource) -> bool {
         self.max_holders.is_some_and(|most| resource.holders.len() >= most) || self.is_closing(resource)
     }
 
-    /// Whether the provider of one of these ends.
+    /// Whether the provider of one of these is ending.
     pub(crate) fn is_any_closing<'a>(&self, mut slots: impl Iterator<Item = &'a Slot>) -> bool {
         !self.closing.is_empty() && slots.any(|slot| self.get(*slot).is_some_and(|resource| self.is_closing(resource)))
     }
@@ -92,12 +92,12 @@ impl Resources {
         self.by_id.get(id).copied()
     }
 
-    /// The slot that the next new resource gets.
+    /// The slot for the next new resource.
     pub(crate) fn next_slot(&self) -> Slot {
         self.vacant.first().copied().unwrap_or_else(|| Slot::new(self.slots.len()))
     }
 
-    /// False where the slot or the id is taken already.
+    /// False if the slot or the id is taken.
     pub(crate) fn insert(&mut self, slot: Slot, resource: Resource) -> bool {
         if self.get(slot).is_some() || self.by_id.contains_key(resource.description.id.as_str()) {
             return false;
@@ -141,7 +141,7 @@ impl Resources {
         Some(resource)
     }
 
-    /// Changes a resource; its kind and id stay.
+    /// Changes a resource; its kind and id must not change.
     pub(crate) fn change<T>(&mut self, slot: Slot, change: impl FnOnce(&mut Resource) -> T) -> Option<T> {
         let resource = self.slots.get_mut(slot.index())?.as_mut()?;
         let key = |resource: &Resource| (!resource.free().is_zero()).then(|| (special(resource), slot));
@@ -160,12 +160,12 @@ impl Resources {
         Some(changed)
     }
 
-    /// In the order of ids.
+    /// All resources, ordered by id.
     pub(crate) fn iter(&self) -> impl Iterator<Item = (Slot, &Resource)> {
         self.by_id.values().filter_map(|slot| self.get(*slot).map(|resource| (*slot, resource)))
     }
 
-    /// Those behind an id, in the order of ids.
+    /// The resources after an id, ordered by id.
     pub(crate) fn after<'a>(&'a self, id: &'a str) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
         let behind = (Bound::Excluded(id), Bound::Unbounded);
         self.by_id.range::<str, _>(behind).filter_map(|(_, slot)| self.get(*slot).map(|resource| (*slot, resource)))
@@ -175,12 +175,12 @@ impl Resources {
         self.kinds.subclasses(kind).any(|kind| self.by_kind.contains_key(kind))
     }
 
-    /// How many resources there are of a kind and of the kinds below it.
+    /// The number of resources of a kind and its subclasses.
     pub(crate) fn count(&self, kind: &str) -> usize {
         self.of(kind).map(|of_kind| of_kind.all.len()).sum()
     }
 
-    /// Those that a requirement can be met with, in the order of slots; those of subclasses last.
+    /// The resources that match a requirement, ordered by slot; subclasses last.
     pub(crate) fn fitting<'a>(
         &'a self,
         requirement: &'a Requirement,
@@ -188,17 +188,17 @@ impl Resources {
         self.all_of(&requirement.kind).filter(|(_, resource)| resource.description.fits(requirement))
     }
 
-    /// Those of them of which something is free, in the order in which they are given away.
+    /// The matching resources with free units, in the order in which they are given away.
     pub(crate) fn free<'a>(&'a self, requirement: &'a Requirement) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
         self.free_of(&requirement.kind).filter(|(_, resource)| resource.description.fits(requirement))
     }
 
-    /// All of a kind and of the kinds below it, whether they fit or not, in the order of [`Resources::fitting`].
+    /// All resources of a kind and its subclasses, matching or not, in the order of [`Resources::fitting`].
     pub(crate) fn all_of<'a>(&'a self, kind: &'a str) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
         self.present(self.of(kind).flat_map(|of_kind| &of_kind.all))
     }
 
-    /// The same, behind a place.
+    /// The same, after a position.
     pub(crate) fn all_of_after<'a>(
         &'a self,
         kind: &'a str,
@@ -214,7 +214,7 @@ impl Resources {
         })
     }
 
-    /// Those of them of which something is free, in the order of [`Resources::free`].
+    /// The resources of a kind and its subclasses with free units, in the order of [`Resources::free`].
     pub(crate) fn free_of<'a>(&'a self, kind: &'a str) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
         self.present(self.of(kind).flat_map(|of_kind| of_kind.free.iter().map(|(_, slot)| slot)))
     }
@@ -226,27 +226,27 @@ impl Resources {
         slots.filter_map(|slot| self.get(*slot).map(|resource| (*slot, resource)))
     }
 
-    /// What there is of a kind and of the kinds below it.
+    /// The indices of a kind and of its subclasses.
     fn of<'a>(&'a self, kind: &'a str) -> impl Iterator<Item = &'a OfKind> + 'a {
         self.kinds.subclasses(kind).filter_map(|kind| self.by_kind.get(kind))
     }
 
-    /// The family of a kind: kinds of different families have no resource in common.
+    /// The family of a kind: kinds of different families share no resource.
     pub(crate) fn family<'a>(&'a self, kind: &'a str) -> &'a str {
         self.kinds.family(kind)
     }
 
-    /// Whether a requirement can be met with a resource of that description.
+    /// Whether a resource with that description matches a requirement.
     pub(crate) fn fits(&self, description: &Description, requirement: &Requirement) -> bool {
         self.kinds.is_a(&description.kind, &requirement.kind) && description.fits(requirement)
     }
 
-    /// Whether every resource of the kind fits.
+    /// Whether every resource of the kind matches.
     pub(crate) fn fits_every(&self, requirement: &Requirement) -> bool {
         requirement.class.is_none() && requirement.attributes.is_empty() && requirement.conditions.is_empty()
     }
 
-    /// How much of what fits exists, held or not, what is consumed excluded.
+    /// The matching amount that exists, held or not, without what is consumed.
     pub(crate) fn quantity(&self, requirement: &Requirement) -> Quantity {
         if self.fits_every(requirement) {
             return self.of(&requirement.kind).map(|of_kind| of_kind.quantity).sum();
@@ -254,7 +254,7 @@ impl Resources {
         self.fitting(requirement).map(|(_, resource)| resource.quantity()).sum()
     }
 
-    /// How many of what fits are divisible.
+    /// The number of matching divisible resources.
     pub(crate) fn divisible(&self, requirement: &Requirement) -> usize {
         if self.fits_every(requirement) {
             return self.of(&requirement.kind).map(|of_kind| of_kind.divisible).sum();
@@ -262,7 +262,7 @@ impl Resources {
         self.fitting(requirement).filter(|(_, resource)| resource.description.divisible).count()
     }
 
-    /// Whether the indices say the same as the resources do.
+    /// Whether the indices match the resources.
     pub(crate) fn index_agrees(&self) -> bool {
         let indexed: usize = self.by_kind.values().map(|of_kind| of_kind.all.len()).sum();
         let free: usize = self.by_kind.values().map(|of_kind| of_kind.free.len()).sum();
@@ -287,7 +287,7 @@ impl Resources {
     }
 }
 
-/// The more attributes, the more requests it alone can meet: it is given away last, which keeps most options open.
+/// A resource with more attributes alone can satisfy more requests: it is given away last, which keeps most options open.
 fn special(resource: &Resource) -> usize {
     resource.description.attributes.iter().len()
 }

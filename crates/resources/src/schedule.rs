@@ -1,19 +1,17 @@
-//! Scheduling: which waiting requests can be served now.
+//! Scheduling: which waiting requests are served now.
 //!
-//! Waiters are served in order. One that cannot be yet, but could be if the holders let go, reserves every free unit that it
-//! would take: nobody behind it gets those, so it is not overtaken for what it waits for more often than
-//! [`crate::Limits::overtaken`] says (until then it reserves nothing, and who is behind it goes past only if it is served with
-//! that). One that asks for more than exists reserves nothing, or
-//! a missing kind would hold up everybody else.
+//! Waiters are served in order. A waiter that cannot be served yet, but could be if holders released, reserves every free unit that it would take:
+//! later waiters do not get these, so it is not overtaken more often than [`crate::Limits::overtaken`] allows (until then it reserves nothing, and a
+//! later waiter passes only if it is served thereby). A waiter that asks for more than exists reserves nothing, because a missing kind would block
+//! everybody else.
 //!
-//! Families do not touch each other, so what a waiter reserves in one is independent of the rest: when something became free,
-//! it goes to the first in its family that lacks it. Only where the order is disturbed (a more urgent one arrives, something
-//! that was reserved is gone) is a family shared out anew. The work is that for those who get something.
+//! Families are independent, so the reservations of a waiter in one family do not depend on others: free units go to the first waiter of the family
+//! that lacks them. A family is shared out anew only if the order is disturbed (a more urgent waiter arrives, a reserved unit is gone). The work is
+//! proportional to the waiters that get something.
 //!
-//! One turn looks at a bounded number of resources (`expiry.rs`) (and at those of one more waiter): what is left is put off to the next
-//! turn, which [`Pool::next_deadline`] asks for at once. Families have their turns one after the other, and one that is behind holds
-//! up no other. Until all is known of a family, nobody is served past those who wait for something of it; only who also waits for
-//! something of another family that is behind may be passed meanwhile.
+//! One turn reads a limited number of resources (`expiry.rs`), plus those of one waiter; the rest is postponed to the next turn, which
+//! [`Pool::next_deadline`] requests immediately. Families take turns, and a family that is behind blocks no other. Until all changes of a family are
+//! settled, nobody is served past its waiters; only a waiter that also waits for another family that is behind may be passed.
 
 use crate::assignment::{Assignment, Available};
 use crate::group::{Key, takes};
@@ -27,7 +25,7 @@ use std::ops::Bound;
 use std::sync::Arc;
 
 impl Pool {
-    /// Grants whatever can be granted.
+    /// Grants everything that can be granted.
     pub(crate) fn schedule(&mut self) {
         self.queue.unserved = false;
         loop {
@@ -45,8 +43,8 @@ impl Pool {
         }
     }
 
-    /// Finds out what changes mean, as far as that goes in this turn. Not all of a turn is for telling groups of them, so that
-    /// something is left for those of whom it is in doubt whether what exists would do, and for sharing out.
+    /// Settles changes, as far as possible in this turn. Not all of a turn is used for notifying groups, so that time is left for re-examining
+    /// waiters and for sharing out.
     fn catch_up(&mut self) {
         while self.worked < self.enough / 8 * 5 && self.settle() {}
         while self.worked < self.enough / 4 * 3
@@ -61,7 +59,7 @@ impl Pool {
         }
     }
 
-    /// The next family in which something became free of which all is known.
+    /// The next family in which something became free and all changes are settled.
     fn next_changed(&mut self) -> Option<(Arc<str>, bool)> {
         let behind = self.queue.shared.clone().map_or(Bound::Unbounded, Bound::Excluded);
         let changed = &self.queue.changed;
@@ -80,7 +78,7 @@ impl Pool {
         Some((family, anew))
     }
 
-    /// The first that lacks nothing and may have it now.
+    /// The first waiter that lacks nothing and may be granted now.
     fn next_served(&self) -> Option<WaiterId> {
         if !self.may_grant() {
             return None;
@@ -90,13 +88,13 @@ impl Pool {
             let session = self.sessions.get(&waiter.request.session);
             session.is_some_and(|session| self.may_grant_to(session))
                 && self.queue.is_certain(**place)
-                // What goes with its provider was reserved before that ended.
+                // Reserved before the provider ended; the resource is going to be deleted.
                 && !self.resources.is_any_closing(waiter.reserved.iter().flat_map(|units| units.keys()))
         };
         self.queue.ready.iter().find(may_have).map(|(_, id)| *id)
     }
 
-    /// What a request can have at once: all of it, or `None`. Nobody waits before it for any of it.
+    /// What a request can get immediately: all of it, or `None`. No earlier waiter waits for any of it.
     pub(crate) fn at_once(&self, place: Place, requirements: &[Requirement]) -> Option<Vec<Units>> {
         let behind = |requirement: &Requirement| self.queue.is_behind_in(self.resources.family(&requirement.kind));
         if !self.may_grant() || requirements.iter().any(behind) || self.is_before_others(place, requirements) {
@@ -107,7 +105,7 @@ impl Pool {
         assignment.is_complete().then_some(assignment.taken)
     }
 
-    /// Whether somebody waits behind this place for something of it, and may have reserved what is this one's.
+    /// Whether a later waiter waits for something of these requirements, and may have reserved what belongs to this one.
     pub(crate) fn is_before_others(&self, place: Place, requirements: &[Requirement]) -> bool {
         let others = |requirement: &Requirement| {
             let family = self.queue.families.get(self.resources.family(&requirement.kind));
@@ -116,7 +114,7 @@ impl Pool {
         requirements.iter().filter(|r| takes(r)).any(others)
     }
 
-    /// Whether what exists would do for a waiter.
+    /// Re-examines whether existing resources could satisfy a waiter.
     fn reconsider(&mut self, place: Place) {
         let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { return };
         let requirements: Vec<&Requirement> = waiter.request.requirements.iter().collect();
@@ -164,7 +162,7 @@ impl Pool {
         self.queue.growth.look_later(self.now, &self.queue.provided);
     }
 
-    /// Gives what is free in a family to those who lack it, in order; on from where an earlier turn stopped.
+    /// Gives free units of a family to the waiters that lack them, in order; continues where an earlier turn stopped.
     fn share_out(&mut self, family: &Arc<str>, anew: bool) {
         if self.turns_anew(family) {
             self.queue.mark(family, anew);
@@ -189,7 +187,7 @@ impl Pool {
         };
         let mut heads: BTreeSet<(Place, Key)> = known.groups.iter().filter_map(first).collect();
         self.worked += known.groups.len();
-        // Somebody gets on each time, and other families have their turn.
+        // At least one waiter is processed each time, and other families get their turn.
         let most = self.enough.min(self.worked + self.enough / 8);
         let mut before = None;
         while let Some((place, key)) = heads.pop_first() {
@@ -213,7 +211,7 @@ impl Pool {
         }
     }
 
-    /// Who went past others because it would be served at once, and is not, keeps nothing of what it went past them for.
+    /// A waiter that passed others because it would be served immediately, and is not, gives back what it passed them for.
     fn take_back_elsewhere(&mut self, place: Place, family: &Arc<str>) {
         let Some(waiter) = self.queue.get(place.1) else { return };
         let of = |key: &Key| self.queue.groups.get(key).map(|group| group.family.clone());
@@ -227,7 +225,7 @@ impl Pool {
         }
     }
 
-    /// What a waiter had reserved in a family is anybody's, and it lacks it.
+    /// Releases a waiter's reservations in a family, which it then lacks.
     fn take_back(&mut self, place: Place, family: &Arc<str>) {
         let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { return };
         let mut freed = Vec::new();
@@ -243,8 +241,8 @@ impl Pool {
         self.unreserve(freed, family);
     }
 
-    /// What was reserved in a family is anybody's. In the slot of a deleted resource there may be one of another family by now, which the
-    /// reservation has hidden from those who wait for it: they are looked at.
+    /// Frees reservations in a family. The slot of a deleted resource may have a resource of another family by now, which the reservation has hidden
+    /// from the waiters of that family: these are examined again.
     pub(crate) fn unreserve(&mut self, units: impl IntoIterator<Item = (Slot, Quantity)>, family: &str) {
         for (slot, amount) in units {
             self.queue.unreserve(slot, amount);
@@ -256,7 +254,7 @@ impl Pool {
         }
     }
 
-    /// Reserves for a waiter what it lacks in a family, as far as that is free and nobody before it is passed for long.
+    /// Reserves what a waiter lacks in a family, as far as it is free and no earlier waiter is passed for long.
     fn attempt(&mut self, place: Place, family: &Arc<str>) {
         self.take_back(place, family);
         let Some(known) = self.queue.families.get_mut(family) else { return };
@@ -277,9 +275,9 @@ impl Pool {
         }
     }
 
-    /// Whether somebody before it lacks something of the family and reserves nothing: what is free there goes past them. Only to
-    /// one who gets all that it lacks with it, and so is served at once. If it were reserved for longer, those two could wait
-    /// for each other, with one reserving what the other lacks.
+    /// Whether an earlier waiter lacks units of the family and reserves nothing: free units pass it. They go only to a waiter that gets everything it
+    /// lacks, and so is served immediately. If they were reserved for longer, two waiters could wait for each other, one reserving what the other
+    /// lacks.
     fn passes(&self, place: Place, family: &Arc<str>) -> bool {
         if self.limits.overtaken == 0 {
             return false;
@@ -295,7 +293,7 @@ impl Pool {
         let Some(waiter) = self.queue.get(place.1) else { return };
         let mut found = Vec::new();
         for family in &waiter.lacks {
-            // What became free there goes to those before it first; then it is looked at again.
+            // Freed units go to earlier waiters first; then this one is examined again.
             if self.queue.changed.contains_key(family) {
                 return;
             }
@@ -310,7 +308,7 @@ impl Pool {
         }
     }
 
-    /// What of a family a waiter could have now, beside what is reserved; and for which of its requirements that is.
+    /// What a waiter could get of a family now, besides reservations; and the indices of the requirements.
     pub(crate) fn assigned(&self, waiter: &Waiter, family: &Arc<str>) -> (Vec<usize>, Assignment) {
         let of_family = |key: &Key| self.queue.groups.get(key).is_some_and(|group| group.family == *family);
         let indices: Vec<usize> = (0..waiter.groups.len())
@@ -348,7 +346,8 @@ impl Pool {
         }
     }
 
-    /// Reserves, for each whole unit that a waiter lacks, what is free of one that is divided, so that it comes together: those with the most.
+    /// Reserves, for each whole unit that a waiter lacks, fractions of divided units, so that whole units become available: those with the largest
+    /// free fraction.
     fn reserve_parts(&mut self, place: Place, family: &Arc<str>, missing: impl Iterator<Item = (usize, Quantity)>) {
         for (index, missing) in missing.filter(|(_, missing)| !missing.is_zero()) {
             let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { return };
@@ -380,8 +379,8 @@ impl Pool {
         }
     }
 
-    /// Counts, for those before `place` that lack what is now taken, that they were overtaken. From the last time on that one may be,
-    /// it and all before it reserve what is free.
+    /// Counts an overtaking for the waiters before `place` that lack what is now taken. When a waiter reaches the limit, it and all before it reserve
+    /// what is free.
     pub(crate) fn overtake(&mut self, place: Place, taken: &[Units]) {
         if self.limits.overtaken == 0 || self.queue.families.is_empty() {
             return;

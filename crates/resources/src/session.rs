@@ -1,4 +1,4 @@
-//! Sessions: everything that a client provides, holds, waits for or has consumed hangs on one.
+//! Sessions: everything that a client provides, holds, waits for or has consumed belongs to one.
 
 use crate::caller::for_all;
 use crate::error::{ALL, ALL_BUT_OPERATORS, PoolError, malformed};
@@ -21,29 +21,29 @@ use std::time::Duration;
 pub(crate) struct Session {
     /// The client's name, for people.
     pub(crate) name: String,
-    /// Who opened it, as the connection proved: nobody else speaks for it. Empty where nobody knows.
+    /// The caller who opened it, as the connection proved: nobody else may use it. Empty if unknown.
     pub(crate) opened_by: Arc<str>,
-    /// Whether that is an operator, as its last ping said; nothing before the first one after a restart.
+    /// Whether that caller is an operator, according to the last ping; `None` before the first ping after a restart.
     pub(crate) for_anybody: Option<bool>,
-    /// Which of all sessions of this pool it is: one that is opened anew under the same id has another number. 0 where it was opened by a
-    /// version that did not number them.
+    /// The number of the session among all sessions of this pool: a session that is opened again under the same id has another number. 0 if it was
+    /// opened by a version that did not number sessions.
     pub(crate) number: u64,
     /// How long it lives without a keep-alive.
     pub(crate) ttl: Duration,
-    /// When it expires unless kept alive.
+    /// When it expires unless it is kept alive.
     pub(crate) expires: Timestamp,
-    /// It ends, and why: it is nobody's any more, though not everything that hung on it is gone yet. Where that takes several turns,
-    /// its `ttl` is 0, which is how it is written down.
+    /// The reason if it is ending: it cannot be used any more, but not everything that belongs to it is removed. If that takes several turns, its
+    /// `ttl` is recorded as 0.
     pub(crate) ending: Option<EndReason>,
-    /// The resources that vanish with it.
+    /// The resources that it provides, which are deleted with it.
     pub(crate) provides: BTreeSet<Slot>,
     /// Its leases.
     pub(crate) leases: BTreeSet<LeaseId>,
     /// Its queued acquires.
     pub(crate) waiters: BTreeSet<WaiterId>,
-    /// The resources of which it has consumed something that returns at its task's end.
+    /// The resources of which it has consumed units that return when its task ends.
     pub(crate) consumed: BTreeSet<Slot>,
-    /// What it is beside others, as it has said since the pool was made or restored.
+    /// Its standing beside others, as set since the pool was created or restored.
     pub(crate) standing: Standing,
 }
 
@@ -54,39 +54,39 @@ pub struct SessionView {
     pub id: SessionId,
     /// The client's name.
     pub name: String,
-    /// Who opened it, as the connection proved; empty where nobody knows.
+    /// The caller who opened it, as the connection proved; empty if unknown.
     pub opened_by: Arc<str>,
     /// How long it lives without a keep-alive.
     pub ttl: Duration,
-    /// When it expires unless kept alive.
+    /// When it expires unless it is kept alive.
     pub expires: Timestamp,
     /// Its live leases.
     pub leases: Vec<LeaseId>,
     /// Its queued acquires.
     pub waiters: Vec<WaiterId>,
-    /// Ids of the resources that it provides, in order.
+    /// The ids of the resources that it provides, in order.
     pub provides: Vec<String>,
-    /// What it is beside others.
+    /// Its standing beside others.
     pub standing: Standing,
 }
 
-/// Who speaks for sessions, as the connection proves it.
+/// The caller who uses sessions, as the connection proves.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Speaker {
-    /// The same name is the same speaker.
+    /// The name; equal names are the same caller.
     pub name: Arc<str>,
-    /// Also for sessions that others opened: an operator.
+    /// Whether it may also use sessions that others opened: an operator.
     pub for_anybody: bool,
 }
 
 impl Speaker {
-    /// Where nobody else is: inside a process, in a simulation.
+    /// If there are no other callers: inside a process, in a simulation.
     pub fn trusted() -> Speaker {
         Speaker { name: Arc::default(), for_anybody: true }
     }
 }
 
-/// By id.
+/// Sessions by id.
 pub(crate) type Sessions = BTreeMap<SessionId, Session>;
 
 impl Session {
@@ -107,22 +107,22 @@ impl Session {
         }
     }
 
-    /// Whether it is an operator's, or of one who is not known.
+    /// Whether it belongs to an operator, or to an unknown caller.
     pub(crate) fn is_operators(&self) -> bool {
         self.for_anybody == Some(true) || self.opened_by.is_empty()
     }
 
-    /// Whether it is known to be nobody's who is an operator.
+    /// Whether it is known not to belong to an operator.
     pub(crate) fn is_no_operators(&self) -> bool {
         self.for_anybody == Some(false) && !self.opened_by.is_empty()
     }
 }
 
 impl Pool {
-    /// As [`Pool::keep_alive_as`], by [`Speaker::trusted`].
+    /// Like [`Pool::keep_alive_as`], with [`Speaker::trusted`].
     ///
     /// # Errors
-    /// As there.
+    /// The same as there.
     pub fn keep_alive(
         &mut self,
         now: Timestamp,
@@ -133,12 +133,12 @@ impl Pool {
         self.keep_alive_as(now, &Speaker::trusted(), id, client, ttl)
     }
 
-    /// The session lives for `ttl` from now. An unknown or expired one is opened (anew: nothing of an earlier one is left) by the
-    /// speaker, whose it is from then on, also after its end (see [`Pool::check_speaker`]), and the answer is true. `client` says who that is, for people. Only a new session or
-    /// another `ttl` is written down.
+    /// Keeps the session alive for `ttl` from now. An unknown or expired session is opened (anew: nothing of an earlier one is left) for the speaker,
+    /// who owns it from then on, also after its end (see [`Pool::check_speaker`]); the answer is then true. `client` is a name for people. Only a new
+    /// session or another `ttl` is recorded.
     ///
     /// # Errors
-    /// A session that another opened, or opened last, or that is still ending, a malformed name, no time to live, or too many sessions.
+    /// The session was opened, or last opened, by another caller, or is still ending; the name is malformed; `ttl` is zero; or there are too many sessions.
     pub fn keep_alive_as(
         &mut self,
         now: Timestamp,
@@ -196,7 +196,7 @@ impl Pool {
         }
     }
 
-    /// Whether the speaker may open one more.
+    /// Whether the speaker may open one more session.
     fn check_sessions(&self, speaker: &Speaker) -> Result<(), PoolError> {
         let Limits { sessions, sessions_per_caller, sessions_for_operators, .. } = self.limits;
         if self.sessions.len() >= sessions {
@@ -217,11 +217,11 @@ impl Pool {
         Ok(())
     }
 
-    /// Whether the speaker may speak for a session. One that has ended is still its opener's, as long as its id is kept
-    /// ([`Limits::kept_session_ids`]); any other one that is not there is nobody's.
+    /// Checks that the speaker may use a session. An ended session belongs to its opener as long as its id is kept ([`Limits::kept_session_ids`]);
+    /// any other unknown session belongs to nobody.
     ///
     /// # Errors
-    /// A session that another opened, or the id of one.
+    /// Another caller opened the session, or the id is kept for another caller.
     pub fn check_speaker(&mut self, now: Timestamp, speaker: &Speaker, id: &SessionId) -> Result<(), PoolError> {
         self.begin(now);
         if speaker.for_anybody {
@@ -240,8 +240,7 @@ impl Pool {
         Ok(())
     }
 
-    /// The same pool, in which every session expires so much later, unless it is pinged before: what a predecessor of this pool's owner
-    /// may have promised meanwhile is kept.
+    /// The same pool with every session's expiry delayed by `grace`, unless it is pinged before: this honours what the previous process may have promised.
     #[must_use]
     pub fn with_session_grace(mut self, grace: Duration) -> Pool {
         for (id, session) in self.sessions.iter_mut().filter(|(_, session)| session.ending.is_none()) {
@@ -252,22 +251,21 @@ impl Pool {
         self
     }
 
-    /// The number of a session; 0 where a version opened it that did not number them, nothing where it is unknown. A session that was
-    /// opened anew under its id has another one, also after a restart.
+    /// The number of a session; 0 if a version opened it that did not number sessions, `None` if it is unknown. A session that was opened again under
+    /// its id has another number, also after a restart.
     pub fn session_number(&self, id: &SessionId) -> Option<u64> {
         self.session(id).ok().map(|session| session.number)
     }
 
-    /// How long a session lives without a keep-alive; nothing where it is unknown.
+    /// How long a session lives without a keep-alive; `None` if it is unknown.
     pub fn session_ttl(&self, id: &SessionId) -> Option<Duration> {
         self.session(id).ok().map(|session| session.ttl)
     }
 
-    /// Ends a session and everything that hangs on it. From now on it is unknown; where much hangs on it, the rest of that goes in the
-    /// next turns.
+    /// Ends a session and everything that belongs to it. From now on it is unknown; if much belongs to it, the rest is removed in the next turns.
     ///
     /// # Errors
-    /// An unknown or expired session.
+    /// The session is unknown or expired.
     pub fn close_session(&mut self, now: Timestamp, id: &SessionId) -> Result<(), PoolError> {
         self.begin(now);
         self.session(id)?;
@@ -277,12 +275,12 @@ impl Pool {
         Ok(())
     }
 
-    /// Every session, in the order of ids.
+    /// All sessions, ordered by id.
     pub fn sessions(&self) -> Vec<SessionView> {
         self.sessions.iter().map(|(id, session)| self.session_view(id, session, usize::MAX)).collect()
     }
 
-    /// With so many of its leases and resources at the most.
+    /// With at most `named` of its leases and resources.
     pub(crate) fn session_view(&self, id: &SessionId, session: &Session, named: usize) -> SessionView {
         let provides = session.provides.iter().take(named).filter_map(|slot| self.id_of(*slot));
         let mut provides: Vec<String> = provides.collect();
@@ -300,7 +298,7 @@ impl Pool {
         }
     }
 
-    /// Whether a session is there.
+    /// Whether a session exists.
     pub fn has_session(&self, id: &SessionId) -> bool {
         self.session(id).is_ok()
     }
@@ -310,7 +308,7 @@ impl Pool {
         known.ok_or_else(|| PoolError::UnknownSession { session: id.clone() })
     }
 
-    /// Nobody has a session any more: its waiters leave, and what else hangs on it begins to go.
+    /// Begins to end a session: its waiters leave, and the rest is removed in turns.
     pub(crate) fn begin_end(&mut self, id: &SessionId, reason: EndReason) {
         let Some(session) = self.sessions.get_mut(id) else { return };
         session.ending = Some(reason);
@@ -325,7 +323,7 @@ impl Pool {
         self.end_some_of(id);
     }
 
-    /// Ends what hangs on a session that ends, as much of it as a turn may; and the session with the last of it.
+    /// Removes what belongs to an ending session, up to the limit of a turn, and finally the session.
     pub(crate) fn end_some_of(&mut self, id: &SessionId) {
         while let Some(session) = self.sessions.get(id)
             && let Some(reason) = session.ending
@@ -339,7 +337,7 @@ impl Pool {
                 let amount = resource.map_or(Quantity::ZERO, |resource| resource.consumed_by(id));
                 match resource.is_some_and(|resource| resource.description.renewable) {
                     true => (Effect::Returned { session: id.clone(), slot, amount }, 0),
-                    // It was renewable when it was consumed.
+                    // The resource was renewable when it was consumed.
                     false => (Effect::TaskEnded { session: id.clone() }, session.consumed.len()),
                 }
             } else if let Some(&slot) = session.provides.first() {

@@ -1,8 +1,8 @@
-//! A pool as bytes, and a pool from a snapshot and the records after it.
+//! Writes a pool as bytes, and restores it from a snapshot and the records after it.
 //!
 //! ```text
 //!   pool ──take_records──▶ log            snapshot + records after it ──restore──▶ the same pool
-//!     └──── snapshot ────▶ file             (waiters ask again, sessions have their whole TTL once more)
+//!     └──── snapshot ────▶ file             (waiters have to ask again, the TTLs of sessions begin anew)
 //! ```
 
 use crate::caller::Callers;
@@ -24,18 +24,18 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The last versions without the lives of answers, without ids that are kept, without numbers of sessions, without callers of answers and openers of leases that end, without leases that end, and
-/// without openers of sessions.
+/// The last format versions without: lives of answers, kept ids, numbers of sessions, callers of answers and openers of ended leases, ended leases,
+/// openers of sessions.
 const WITHOUT_LIVES: u8 = 10;
 const WITHOUT_KEPT_IDS: u8 = 9;
 const WITHOUT_NUMBERS: u8 = 6;
 const WITHOUT_CALLERS: u8 = 5;
 const WITHOUT_ENDING: u8 = 4;
 const WITHOUT_OPENERS: u8 = 2;
-/// What it is, in messages.
+/// Its name in messages.
 const SNAPSHOT: &str = "snapshot of a resource pool";
 
-/// Everything durable of a pool at one moment. Taking one shares the descriptions of the resources and copies the rest.
+/// The durable state of a pool. Taking a snapshot shares the descriptions of the resources and copies the rest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Snapshot {
     revision: Revision,
@@ -45,58 +45,59 @@ pub struct Snapshot {
     sessions: Vec<(SessionId, String, Duration)>,
     resources: Vec<(Slot, Resource)>,
     leases: Vec<(LeaseId, LeaseRecord)>,
-    /// The oldest first.
+    /// Oldest first.
     answers: Vec<(String, Fingerprint, Remembered)>,
-    /// Who opened which session; of one that is not here nobody knows.
+    /// The callers who opened the sessions; unknown for sessions that are missing here.
     openers: Vec<(SessionId, Arc<str>)>,
-    /// What leases that have ended have left.
+    /// What ended leases have left.
     ending: Vec<(LeaseId, EndingLease)>,
-    /// To whom the answers were given, in their order; to nobody knows whom where they are not here.
+    /// The callers who got the answers, in the order of the answers; unknown if missing.
     answered: Vec<Arc<str>>,
-    /// Who opened the sessions of the leases that have ended, in their order; as above.
+    /// The callers who opened the sessions of the ended leases, in the order of `ending`; unknown if missing.
     ended: Vec<Arc<str>>,
-    /// The numbers of the sessions, in their order; 0 where they are not here.
+    /// The numbers of the sessions, in the order of `sessions`; 0 if missing.
     numbers: Vec<u64>,
     last_session: u64,
-    /// For whom the ids of sessions that have ended are kept, the oldest first.
+    /// The callers for whom the ids of ended sessions are kept, oldest first.
     kept_ids: Vec<(SessionId, Arc<str>)>,
-    /// The numbers of the sessions with which what was answered ended, in the order of the answers; 0 where it did not, or they are not here.
+    /// The numbers of the sessions with whose end the effects of the answered requests ended, in the order of the answers; 0 if they did not end, or
+    /// if missing.
     lives: Vec<Life>,
 }
 
-/// A snapshot or a record that does not fit: the log has a gap, or is of another pool.
+/// A snapshot or a record that does not fit: the log has a gap, or belongs to another pool.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RestoreError {
-    /// The snapshot contradicts itself.
+    /// The snapshot is inconsistent.
     #[error("the snapshot of revision {revision} contradicts itself: {reason}; restore a backup")]
     Snapshot {
-        /// Of which revision it is.
+        /// The revision of the snapshot.
         revision: u64,
-        /// What is wrong.
+        /// The inconsistency.
         reason: String,
     },
-    /// A record does not follow from what is before it.
+    /// A record does not follow from those before it.
     #[error("record {number} after the snapshot does not fit (revision {revision}): {reason}; restore a backup")]
     Record {
-        /// Which, from 0.
+        /// The index of the record, from 0.
         number: usize,
         /// The pool's revision before it.
         revision: u64,
-        /// What is wrong.
+        /// The inconsistency.
         reason: String,
     },
 }
 
 impl Snapshot {
-    /// For a file.
+    /// The bytes for a file.
     pub fn encode(&self) -> Vec<u8> {
         versioned::encode(FORMAT, self)
     }
 
-    /// Reads what [`Snapshot::encode`] wrote, in this version or an earlier one: each is the one before with more at its end.
+    /// Reads the bytes written by [`Snapshot::encode`], of this version or an earlier one: each version only adds to the end of the previous one.
     ///
     /// # Errors
-    /// Bytes that it did not write, or another version did.
+    /// The bytes were not written by it, or by an unsupported version.
     pub fn decode(bytes: &[u8]) -> Result<Snapshot, DecodeError> {
         let version = versioned::version(OLDEST_FORMAT, FORMAT, SNAPSHOT, bytes)?;
         let without = |last: u8, fields: usize| if version <= last { fields } else { 0 };
@@ -106,7 +107,7 @@ impl Snapshot {
             + without(WITHOUT_NUMBERS, 2)
             + without(WITHOUT_KEPT_IDS, 1)
             + without(WITHOUT_LIVES, 1);
-        // An empty list, or 0, for each that is missing, as postcard writes it.
+        // An empty list, or 0, for each missing field, as postcard writes it.
         let mut snapshot: Snapshot = versioned::decode(version, SNAPSHOT, &[bytes, &[0; 8][..missing]].concat())?;
         if !knows_fingerprints(version) {
             snapshot.answers.iter_mut().for_each(|(_, fingerprint, _)| *fingerprint = Fingerprint::UNKNOWN);
@@ -114,14 +115,14 @@ impl Snapshot {
         Ok(snapshot)
     }
 
-    /// The pool's revision in it.
+    /// The pool's revision in the snapshot.
     pub fn revision(&self) -> Revision {
         self.revision
     }
 }
 
 impl Pool {
-    /// What the pool is now. The records taken after this continue it; take those before it first.
+    /// The present state of the pool. Records taken later continue it; take earlier records first.
     pub fn snapshot(&self) -> Snapshot {
         Snapshot {
             revision: self.revision,
@@ -151,12 +152,12 @@ impl Pool {
         }
     }
 
-    /// The pool of a snapshot (`None`: an empty one) and the records since, at `now` of a clock that need not be that of
-    /// before. Every session and every lease with a time of its own has that time once more, as has every provider that is to confirm standstill; the queue is
-    /// empty.
+    /// Restores a pool from a snapshot (`None`: an empty pool) and the records after it, at `now` of a clock that need not be the previous one. The
+    /// times of every session, of every lease with a maximum holding time, and of every provider that has to confirm standstill begin anew; the queue
+    /// is empty.
     ///
     /// # Errors
-    /// A snapshot or a record that does not fit.
+    /// A snapshot or a record does not fit.
     pub fn restore(
         limits: Limits,
         now: Timestamp,
@@ -171,7 +172,7 @@ impl Pool {
         for (number, record) in records.into_iter().enumerate() {
             let revision = pool.revision.0;
             pool.apply(&record.0).map_err(|reason| RestoreError::Record { number, revision, reason })?;
-            // Nobody hears of it, and a long log's events would pile up.
+            // Nobody receives the notices, and the events of a long log would pile up.
             pool.notices.clear();
         }
         Ok(pool)

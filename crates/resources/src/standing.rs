@@ -1,4 +1,4 @@
-//! What sessions are beside each other: the shares and due times that they say, the turns of their requests, and what is put to whose account.
+//! The standing of sessions: the shares and due times that they set, the turns of their requests, and the updates of their accounts.
 
 use crate::accounts::{Accounts, Within};
 use crate::error::PoolError;
@@ -18,15 +18,15 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// A due time that is said again, counted from another moment, is the same within this.
+/// A due time that is repeated relative to another moment counts as unchanged within this.
 const SAME_DUE: Duration = Duration::from_secs(1);
 
 impl Pool {
-    /// A session says what it is beside others. The share counts for what is held from now on, the due time for what waits, too. Not written
-    /// down: after a restart it is to be said again.
+    /// Sets the standing of a session. The share applies to what is held from now on, the due time also to what waits. Not persistent: after a
+    /// restart it has to be set again.
     ///
     /// # Errors
-    /// An unknown session.
+    /// The session is unknown.
     pub fn set_standing(&mut self, now: Timestamp, id: &SessionId, standing: Standing) -> Result<(), PoolError> {
         self.begin(now);
         let before = self.session(id)?.standing;
@@ -51,19 +51,19 @@ impl Pool {
         Ok(())
     }
 
-    /// From now on what a session has counts by another share, or for a caller with another bound.
+    /// From now on a session counts with another share, or for a caller with another bound.
     pub(crate) fn counts_anew(&mut self, session: &SessionId) {
         let (share, (caller, bound)) = (self.standing(session).share, self.bound_of(session));
         self.accounts.has_share(&Within { session, family: "", share, caller: &caller, bound, now: self.now });
         self.worked += self.accounts.take_looks();
     }
 
-    /// What a session is beside others; as usual where it is unknown.
+    /// The standing of a session; the default if it is unknown.
     pub(crate) fn standing(&self, id: &SessionId) -> Standing {
         self.sessions.get(id).map(|session| session.standing).unwrap_or_default()
     }
 
-    /// What a request keeps of one that it replaces, which leaves the queue; and whose it is, to put it back.
+    /// What a request keeps of one that it replaces, which leaves the queue; and the request id of that one, to put it back.
     pub(crate) fn replaced_by(&mut self, request: &AcquireRequest, id: &RequestId) -> Option<(RequestId, Earlier)> {
         if let Some(earlier) = self.left.take(self.now, id, &request.session) {
             return Some((id.clone(), self.as_served(earlier, request)));
@@ -84,14 +84,14 @@ impl Pool {
         Earlier { kept: earlier.kept.map(|since| self.not_before_served(request, since)), ..earlier }
     }
 
-    /// The time since which a request waits, or when the last one was served that was the first of its session where it wants something.
+    /// The later of `since` and the last service of a first request of the session in the wanted families.
     pub(crate) fn not_before_served(&self, request: &AcquireRequest, since: Timestamp) -> Timestamp {
         let session = &request.session;
         let served = |family| self.accounts.served(session, family).max(self.left.served(session, family));
         self.families_taken(&request.requirements).into_iter().map(served).fold(since, Timestamp::max)
     }
 
-    /// The turn of a request that would wait from now on.
+    /// The turn of a request that begins to wait now.
     pub(crate) fn turn_of(&mut self, request: &AcquireRequest, kept: Option<Timestamp>, id: WaiterId) -> Turn {
         if self.would_be_first(request, id) {
             return self.first_turn(request, kept.unwrap_or(self.now));
@@ -104,13 +104,13 @@ impl Pool {
         Turn::behind(request.speculative, self.standing(&request.session).due, request.priority)
     }
 
-    /// The turn of the first request of its session.
+    /// The turn of a first request of its session.
     fn first_turn(&mut self, request: &AcquireRequest, since: Timestamp) -> Turn {
         let since = self.not_before_served(request, since);
         let (due, mut ahead) = (self.standing(&request.session).due, Duration::ZERO);
         self.in_accounts(request, |accounts, within| ahead = ahead.max(accounts.ahead(within)));
         self.worked += self.accounts.take_looks();
-        // More than that only where the shares of its caller are beyond their bound.
+        // A difference above `AHEAD` is only possible if the shares of its caller exceed their bound.
         let since = since + ahead.saturating_sub(AHEAD);
         Turn::of(request.speculative, step(since, ahead), due, request.priority)
     }
@@ -119,7 +119,7 @@ impl Pool {
         self.accounts.is_first(&request.session, self.families_taken(&request.requirements), &request.own_place(id))
     }
 
-    /// A waiter competes from now on: what exists would do for it.
+    /// A waiter begins to compete: existing resources could satisfy it.
     pub(crate) fn competes(&mut self, id: WaiterId) {
         let Some(request) = self.queue.get(id).map(|waiter| waiter.request.clone()) else { return };
         self.in_accounts(&request, |accounts, within| accounts.waits(within, request.own_place(id)));
@@ -131,7 +131,7 @@ impl Pool {
         self.settle_firsts();
     }
 
-    /// It does not any more, though it stays.
+    /// A waiter stops competing, but stays.
     pub(crate) fn competes_no_more(&mut self, id: WaiterId) {
         let Some(request) = self.queue.get(id).map(|waiter| waiter.request.clone()) else { return };
         self.set_first(id, false);
@@ -139,7 +139,7 @@ impl Pool {
         self.settle_firsts();
     }
 
-    /// It does not any more; it was served as the first of its session, or was not. Who is the first of its session then is to be settled.
+    /// A waiter stops competing; `served` if it was served as a first request of its session. `settle_firsts` has to follow.
     pub(crate) fn has_competed(&mut self, request: &AcquireRequest, id: WaiterId, served: bool) {
         let (own, families) = (request.own_place(id), self.families_of(request));
         if served {
@@ -149,7 +149,7 @@ impl Pool {
         self.in_accounts(request, |accounts, within| accounts.waits_no_more(within, own, served));
     }
 
-    /// Who is the first of its session, where requests have come or gone. Once for all that come and go together.
+    /// Updates the first requests of sessions, after requests have come or gone. Once for all changes together.
     pub(crate) fn settle_firsts(&mut self) {
         while let Some(Settled { no_more, anew, .. }) = self.accounts.settle_next() {
             no_more.into_iter().for_each(|id| self.set_first(id, false));
@@ -168,7 +168,7 @@ impl Pool {
         self.turn_anew(id);
     }
 
-    /// Puts a waiter where it stands now; whether that is another place.
+    /// Recomputes the turn of a waiter; returns whether its place has changed.
     fn turn_anew(&mut self, id: WaiterId) -> bool {
         let Some(waiter) = self.queue.get(id) else { return false };
         let (request, since, before) = (waiter.request.clone(), waiter.since, waiter.turn);
@@ -180,7 +180,7 @@ impl Pool {
         moves
     }
 
-    /// What sessions have had since is another amount: puts the first of each in a family where they stand now; whether one moved.
+    /// The services of sessions have changed: recomputes the turns of their first requests in a family; returns whether one moved.
     pub(crate) fn turns_anew(&mut self, family: &str) -> bool {
         let firsts = self.accounts.firsts(family);
         self.worked += firsts.len();
@@ -191,7 +191,7 @@ impl Pool {
         moved
     }
 
-    /// Does something in the accounts that the session of a request has of the families that it takes something of.
+    /// Updates the accounts of a request's session in the families from which the request takes units.
     fn in_accounts(&mut self, request: &AcquireRequest, mut act: impl FnMut(&mut Accounts, &Within<'_>)) {
         let (session, Standing { share, .. }) = (&request.session, self.standing(&request.session));
         let (caller, bound) = self.bound_of(session);
@@ -202,7 +202,7 @@ impl Pool {
         }
     }
 
-    /// Does something in the account that a session has of the family of a kind.
+    /// Updates the account of a session in the family of a kind.
     pub(crate) fn in_account(&mut self, session: &SessionId, kind: &str, act: impl FnOnce(&mut Accounts, &Within<'_>)) {
         let Standing { share, .. } = self.standing(session);
         let (caller, bound) = self.bound_of(session);
@@ -210,14 +210,14 @@ impl Pool {
         act(&mut self.accounts, &Within { session, family, share, caller: &caller, bound, now: self.now });
     }
 
-    /// Whose a session is, and the bound on the shares of all of that caller's sessions, in thousandths; operators have none.
+    /// The caller who opened a session, and the bound on the total share of that caller's sessions, in thousandths; `None` for operators.
     fn bound_of(&self, session: &SessionId) -> (Arc<str>, Option<u64>) {
         let Some(known) = self.sessions.get(session) else { return Default::default() };
         let bound = u64::from(self.limits.share_per_caller) * Share::ONE.thousandths();
         (known.opened_by.clone(), (!known.is_operators()).then_some(bound))
     }
 
-    /// The accounts of those who hold something, from now on. Nobody waits.
+    /// Opens accounts for all sessions that hold something. The queue is empty.
     pub(crate) fn open_accounts(&mut self) {
         self.accounts = Accounts::default();
         let held: Vec<(SessionId, String, Quantity)> = self
@@ -234,7 +234,7 @@ impl Pool {
         }
     }
 
-    /// The families of which something is wanted.
+    /// The families from which something is wanted.
     fn families_taken<'a>(&'a self, requirements: &'a [Requirement]) -> BTreeSet<&'a str> {
         kinds_taken(requirements).map(|kind| self.resources.family(kind)).collect()
     }
@@ -243,7 +243,7 @@ impl Pool {
         self.families_taken(&request.requirements).into_iter().map(Arc::from).collect()
     }
 
-    /// The same of what everybody has, for the invariants.
+    /// Checks the accounts against the leases and the queue, for the invariants.
     pub(crate) fn accounts_agree(&self) -> Result<(), String> {
         let mut has = BTreeMap::<_, (Quantity, usize)>::new();
         for lease in self.leases.values() {
@@ -269,7 +269,7 @@ impl Pool {
     }
 }
 
-/// The kinds of which something is wanted.
+/// The kinds from which something is wanted.
 fn kinds_taken(requirements: &[Requirement]) -> impl Iterator<Item = &str> {
     requirements.iter().filter(|requirement| takes(requirement)).map(|requirement| requirement.kind.as_str())
 }
@@ -279,14 +279,14 @@ impl AcquireRequest {
         (self.speculative, Reverse(self.priority), id)
     }
 
-    /// For what may turn out not to be needed: all that is needed for certain comes before it.
+    /// Marks it as speculative: everything that is certainly needed comes first.
     #[must_use]
     pub fn speculative(mut self, speculative: bool) -> AcquireRequest {
         self.speculative = speculative;
         self
     }
 
-    /// In the place of another request of the session, by its id: it keeps the time at which that one was asked, and that one leaves.
+    /// Replaces another request of the session, given by its id: it keeps that request's waiting time, and that request leaves.
     #[must_use]
     pub fn instead_of(mut self, request_id: &str) -> AcquireRequest {
         request_id.clone_into(&mut self.instead_of);
@@ -295,7 +295,7 @@ impl AcquireRequest {
 }
 
 impl Standing {
-    /// With this share, and nothing due.
+    /// A standing with this share, and no due time.
     pub fn of(share: Share) -> Standing {
         Standing { share, due: None }
     }
@@ -323,7 +323,7 @@ mod tests {
         AcquireRequest::new(session(number), KINDS.iter().map(blocks).collect())
     }
 
-    /// The first session holds all, each of them waits for it, and the second one often, until then.
+    /// The first session holds everything, each session waits for it, and the second one with many more requests, whose deadline is `until`.
     fn crowded(until: Timestamp) -> Pool {
         let mut pool = Pool::new(Limits::default());
         for number in 0..SESSIONS {
@@ -343,12 +343,12 @@ mod tests {
             pool.advance(Timestamp(0));
         }
         pool.check_invariants().unwrap();
-        // What follows is not put off, and nothing else is counted.
+        // Nothing that follows is postponed, and no other work is counted.
         pool.work = Work { per_turn: 0, per_call: 0 };
         pool
     }
 
-    /// As long as one look at each account of each family, and some more.
+    /// Checks that the work was about one read of each account of each family.
     fn looked_little(pool: &Pool) {
         assert!(pool.worked < 2 * KINDS.len() * SESSIONS + SESSIONS + 200, "{} looks", pool.worked);
         pool.check_invariants().unwrap();

@@ -1,15 +1,16 @@
 //! Turns: the order in which waiting requests are served.
 //!
-//! Of each session only the first requests compete, one for each family of kinds at the most (`own_order.rs`), by its own order: certain
-//! before speculative, then the larger priority, then who came first. Requests for what does not exist do not count. Those behind the first
-//! ones wait for them, behind the first ones of all others that are as certain. So a session alone is served by its own order, but that none
-//! waits for a family because of another one that waits behind others in another family.
+//! Only the first requests of each session compete, at most one for each family of kinds (`own_order.rs`), in the session's own order: certain before
+//! speculative, then the larger priority, then the earlier arrival. Requests for what does not exist do not count. The other requests of a session
+//! wait for its first ones, and come after the first ones of all other sessions that are equally certain. So a session alone is served in its own
+//! order, except that a request waits for no family because of an earlier one that waits behind others in another family.
 //!
-//! What is needed for certain comes before what is speculative. Then, by time in steps of [`LEAD`]: since when a request is due for a turn, or
-//! later, where its session has had more for its share than others who wait (`accounts.rs`), by [`AHEAD`] at the most. That is since when it
-//! waits and what exists would do, or, if that is later, since the last first one of its session was served in a family that it wants. So a
-//! first one that is withdrawn leaves its place to the next with the time since which that one waits, which may be long. Within a step, the
-//! most urgent (bits 60 and up of a priority), then the session whose task is due first, then the larger priority, then who came first.
+//! Certain requests come before speculative ones. Then the order is by time in steps of [`LEAD`]: since when a request is due for a turn, delayed by
+//! at most [`AHEAD`] if its session has used more for its share than other waiting sessions (`accounts.rs`). A request is due since it waits and
+//! existing resources could satisfy it, or, if that is later, since a first request of its session was last served in a family that it wants. So a
+//! first request that is withdrawn leaves its place to the next one with that one's own waiting time, which may be long. Within a step, the order is
+//! by urgency (bits 60 and up of a priority), then by the earlier due time of the session's task, then by the larger priority, then by the earlier
+//! arrival.
 //!
 //! ```text
 //!   due since ≤ time of the turn ≤ due since + AHEAD         step = time of the turn / LEAD, rounded down
@@ -18,9 +19,10 @@
 //!   v is due since b, and served before w:             step(v) ≤ step(w), and step(v) ≥ ⌊b / LEAD⌋, so b < a + AHEAD + LEAD
 //! ```
 //!
-//! So of what is needed for certain and a first one of its session, nobody is passed by a request of another session that is due `AHEAD + LEAD`
-//! later, whatever its priority, share or due time. (Where the shares of its caller are beyond their bound, `AHEAD` is as many times longer for it.) A request may keep the time of another one of its session that it replaces (`replaced.rs`);
-//! one that becomes certain so keeps [`LEAD`] of it at the most. It passes nobody who was due [`BOUND`] before it became certain.
+//! So a first request that is certainly needed is not passed by a request of another session that is due `AHEAD + LEAD` later, whatever the priority,
+//! share or due time of that one. (If the shares of its caller exceed their bound, `AHEAD` is longer for it by the same factor.) A request may keep
+//! the waiting time of another one of its session that it replaces (`replaced.rs`); if it thereby becomes certain, it keeps at most [`LEAD`] of it.
+//! It passes no request that was due [`BOUND`] before it became certain.
 
 use ratn_model::time::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -28,22 +30,22 @@ use std::cmp::Reverse;
 use std::fmt;
 use std::time::Duration;
 
-/// By so much a turn is later than its request at the most, for what its session has had.
+/// Maximum delay of a turn because of what its session has used.
 pub const AHEAD: Duration = Duration::from_secs(60);
-/// What is asked within such a step of time is served by urgency, due time and priority.
+/// Requests within such a step of time are served by urgency, due time and priority.
 pub const LEAD: Duration = Duration::from_secs(10);
-/// A first request of a session that needs something for certain is not passed by one of another session that is due so much later: that began
-/// to wait, became certain, or had another one of its session served before it.
+/// A certain first request of a session is not passed by one of another session that is due this much later: that began to wait, became certain, or
+/// had another request of its session served this much later.
 pub const BOUND: Duration = Duration::from_secs(AHEAD.as_secs() + 2 * LEAD.as_secs());
-/// The bits of a priority from this one on are its urgency.
+/// The bits of a priority from this one on are the urgency.
 const URGENCY_BITS: u32 = 60;
 
-/// How much a session is to have of what several want, beside the shares of the others: thousandths of the usual share.
+/// The share (weight) of a session for contested resources, relative to the shares of others: in thousandths of the usual share.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "f64", into = "f64")]
 pub struct Share(u32);
 
-/// A share that is no number from [`Share::LEAST`] to [`Share::MOST`].
+/// The number is not within [`Share::LEAST`] and [`Share::MOST`].
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[error("a share is a number from {} to {}, and 1 is the usual one", Share::LEAST, Share::MOST)]
 pub struct NoShare;
@@ -51,15 +53,15 @@ pub struct NoShare;
 impl Share {
     /// The usual share.
     pub const ONE: Share = Share(1_000);
-    /// The least.
+    /// The smallest share.
     pub const LEAST: Share = Share(10);
-    /// The largest.
+    /// The largest share.
     pub const MOST: Share = Share(100_000);
 
-    /// The share of a number, in thousandths.
+    /// The share for a number, rounded to thousandths.
     ///
     /// # Errors
-    /// A number that is none, or outside of the bounds.
+    /// Not a number, or outside of the limits.
     pub fn new(number: f64) -> Result<Share, NoShare> {
         let thousandths = (number * 1_000.0).round();
         if !(f64::from(Share::LEAST.0)..=f64::from(Share::MOST.0)).contains(&thousandths) {
@@ -68,7 +70,7 @@ impl Share {
         Ok(Share(thousandths as u32))
     }
 
-    /// As a number.
+    /// The share as a number.
     pub fn number(self) -> f64 {
         f64::from(self.0) / 1_000.0
     }
@@ -104,54 +106,54 @@ impl fmt::Display for Share {
     }
 }
 
-/// What a session says of itself beside others.
+/// The standing that a session sets for itself.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Standing {
     /// Its share.
     pub share: Share,
-    /// When its task is due.
+    /// The due time of its task.
     pub due: Option<Timestamp>,
 }
 
-/// Where a request stands; the smaller one is served first. In the order of comparison.
+/// The turn of a request; smaller turns are served first. The fields are in the order of comparison.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Turn {
     speculative: bool,
     step: u32,
     urgency: Reverse<i8>,
-    /// Whole seconds; [`NEVER`] where nothing is due.
+    /// Whole seconds; [`NEVER`] without a due time.
     due: u32,
     priority: Reverse<i64>,
 }
 
 const NEVER: u32 = u32::MAX;
-/// Behind every step of time.
+/// After every step of time.
 const BEHIND: u32 = u32::MAX;
 
 impl Turn {
-    /// Behind every turn.
+    /// After every turn.
     pub(crate) const LAST: Turn =
         Turn { speculative: true, step: u32::MAX, urgency: Reverse(i8::MIN), due: NEVER, priority: Reverse(i64::MIN) };
 
-    /// Of a request behind others of its session.
+    /// The turn of a request behind others of its session.
     pub(crate) fn behind(speculative: bool, due: Option<Timestamp>, priority: i64) -> Turn {
         Turn::of(speculative, BEHIND, due, priority)
     }
 
-    /// Of the first request of its session.
+    /// The turn of a first request of its session.
     pub(crate) fn of(speculative: bool, step: u32, due: Option<Timestamp>, priority: i64) -> Turn {
         let due = due.map_or(NEVER, |due| seconds(due).min(NEVER - 1));
         let urgency = Reverse((priority >> URGENCY_BITS) as i8);
         Turn { speculative, step, urgency, due, priority: Reverse(priority) }
     }
 
-    /// Whether others of its session are before it.
+    /// Whether others of its session come before it.
     pub(crate) fn is_behind(self) -> bool {
         self.step == BEHIND
     }
 }
 
-/// The step of what is the first since then, of a session that is so far ahead of others.
+/// The step of a first request that is due since then, of a session that is this far ahead of others.
 pub(crate) fn step(since: Timestamp, ahead: Duration) -> u32 {
     seconds(since + ahead.min(AHEAD)) / LEAD.as_secs() as u32
 }

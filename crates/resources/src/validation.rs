@@ -1,4 +1,4 @@
-//! Validation of every request before it is handled: names, amounts, numbers of things.
+//! Validation of every request before it is handled: names, amounts, numbers of items.
 
 use crate::assignment::selects_the_same;
 use crate::error::{PoolError, malformed};
@@ -10,7 +10,7 @@ use ratn_model::value::Value;
 use ratn_model::versioned;
 use serde::Serialize;
 
-/// Of an address.
+/// Maximum length of an endpoint.
 const ENDPOINT_BYTES: usize = 1_024;
 
 impl Pool {
@@ -52,7 +52,7 @@ impl Pool {
         self.check_work(requirements)
     }
 
-    /// Whether it is not too much to look for what these requirements select.
+    /// Checks that the search for what these requirements select is not too much work.
     fn check_work(&self, requirements: &[Requirement]) -> Result<(), PoolError> {
         let mut comparisons = 0_usize;
         for (index, requirement) in requirements.iter().enumerate() {
@@ -70,7 +70,7 @@ impl Pool {
         Ok(())
     }
 
-    /// Whether what is stored of a resource is small enough to be told of.
+    /// Checks that a resource is small enough to be stored and reported.
     pub(crate) fn check_size(&self, spec: &ResourceSpec) -> Result<(), PoolError> {
         let name = || spec.id.as_ref().unwrap_or(&spec.kind);
         let bytes = written_bytes(spec);
@@ -116,7 +116,7 @@ impl Pool {
     }
 }
 
-/// As it is kept.
+/// The size when stored.
 fn written_bytes(value: &impl Serialize) -> usize {
     versioned::encode(0, value).len()
 }

@@ -1,8 +1,8 @@
-//! Request ids that were withdrawn before their acquire was heard of: the acquire may still be on its way, and is refused when it arrives.
-//! One of an id that was heard of before acquires anew, however often that was withdrawn: so ids that were refused or undone are known, too.
+//! Request ids that were withdrawn before their acquire arrived: the acquire may still be under way, and is refused when it arrives. An acquire whose
+//! id was received before acquires anew, however often that id was withdrawn: so ids of refused or undone acquires are kept, too.
 //!
-//! Kept as long as answers are (`memory.rs`), bounded for each caller and in all in the same way; ids of either sort displace none of the
-//! other of their caller. Not written down: what was on its way to a process that has ended does not arrive.
+//! Kept as long as answers (`memory.rs`), limited per caller and in total in the same way; ids of either sort displace none of the other sort of
+//! their caller. Not persistent: calls under way to a process that has ended do not arrive.
 
 use crate::id::SessionId;
 use crate::limits::Limits;
@@ -12,10 +12,10 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Of one caller and sort at the most: its own oldest is forgotten first.
+/// Maximum number per caller and sort: the caller's own oldest is forgotten first.
 const OF_CALLER: usize = 4_096;
 
-/// By who withdrew.
+/// By the caller who withdrew.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Withdrawals {
     callers: BTreeMap<Arc<str>, OfCaller>,
@@ -23,7 +23,7 @@ pub(crate) struct Withdrawals {
 
 #[derive(Debug, Clone, Default)]
 struct OfCaller {
-    /// Of another session of the caller the id is free.
+    /// Only for this session: in another session of the caller the id is free.
     withdrawn: Ids<(Arc<str>, SessionId)>,
     heard_of: Ids<Arc<str>>,
 }
@@ -31,7 +31,7 @@ struct OfCaller {
 #[derive(Debug, Clone)]
 struct Ids<T> {
     known: BTreeSet<T>,
-    /// The oldest first.
+    /// Oldest first.
     order: VecDeque<(Timestamp, T)>,
 }
 
@@ -69,7 +69,7 @@ impl OfCaller {
         self.withdrawn.order.len() + self.heard_of.order.len()
     }
 
-    /// Of what there is more of.
+    /// Forgets the oldest id of the sort that has more.
     fn forget_oldest(&mut self) {
         if self.heard_of.order.len() >= self.withdrawn.order.len() {
             self.heard_of.forget_oldest();
@@ -80,7 +80,7 @@ impl OfCaller {
 }
 
 impl Withdrawals {
-    /// Whether it was withdrawn in this session, and no acquire was heard of.
+    /// Whether the id was withdrawn in this session, before its acquire arrived.
     pub(crate) fn is_withdrawn(&self, id: &RequestId, session: &SessionId) -> bool {
         self.callers.get(&id.caller).is_some_and(|own| {
             !own.heard_of.known.contains(&id.id) && own.withdrawn.known.contains(&(id.id.clone(), session.clone()))
@@ -95,7 +95,7 @@ impl Withdrawals {
         }
     }
 
-    /// No answer is known that this id was given.
+    /// The id was withdrawn, and no answer to it is known.
     pub(crate) fn withdrawn(&mut self, now: Timestamp, limits: &Limits, id: RequestId, session: &SessionId) {
         self.callers.entry(id.caller).or_default().withdrawn.keep(now, (id.id, session.clone()));
         self.forget(now, limits);
@@ -149,7 +149,7 @@ mod tests {
         (0..=OF_CALLER).for_each(|number| withdrawals.withdrawn(at(1_500), &unbounded, id("eve", number), &session()));
         let is_known = |withdrawals: &Withdrawals, number| withdrawals.is_withdrawn(&id("eve", number), &session());
         assert!(!is_known(&withdrawals, 0) && is_known(&withdrawals, OF_CALLER));
-        // Many that were refused displace none of those.
+        // Many refused ids displace none of these.
         (9_000..20_000).for_each(|number| withdrawals.heard_of(at(1_500), &unbounded, id("eve", number)));
         assert!(is_known(&withdrawals, 1) && is_known(&withdrawals, OF_CALLER));
     }

@@ -1,9 +1,9 @@
-//! Looks for a better order of what is ready, in one thread, while something runs: what the window still has to do goes in, and an
-//! advice comes out as an event where one was found. What is advised is in the log, so a replay needs no search.
+//! Searches for a better dispatch order in one thread while the run goes on: the input is the rest of the window, the output is an event with advice
+//! if a better order was found. Advice is logged, so a replay needs no search.
 //!
-//! Bounded: one thread; a question replaces the one before it; each is thought about for [`THINKING`] at the most, where more than that can be gained, and at most
-//! one is asked per [`PAUSE`], when enough has changed ([`ratn_executive::lookahead::Lookout`]). Each goes on with the good orders that were
-//! found for the one before, so that a long run is thought about for long.
+//! Bounded: one thread; a new problem replaces the previous one; each is searched for at most [`THINKING`], and only if more time than that can be
+//! gained; at most one problem is given per [`PAUSE`], when enough has changed ([`ratn_executive::lookahead::Lookout`]). Each search starts from the
+//! good orders of the previous one, so that a long run is searched for a long time.
 
 use ratn_executive::lookahead::{Memory, Problem, Search};
 use ratn_executive::protocol::Event;
@@ -11,18 +11,18 @@ use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
 
-/// Wall time for one question.
+/// Maximum wall time for one search.
 const THINKING: Duration = Duration::from_millis(50);
-/// Wall time from one question to the next.
+/// Minimum wall time between two searches.
 pub(super) const PAUSE: Duration = Duration::from_millis(200);
-/// Orders that are simulated between two looks at the clock.
+/// Number of orders that are simulated between two reads of the clock.
 const ORDERS: usize = 32;
-/// A gain below this share of what is left is not worth asking for everything again.
+/// A gain below this fraction of the remaining time does not justify a new round of acquires.
 const WORTHWHILE: f64 = 0.002;
-/// Advice that the run has not been told yet.
+/// Maximum number of pieces of advice that the run has not received yet.
 const MAX_PENDING: usize = 2;
 
-/// The thread, and what lies on its context.
+/// The search thread, and the state shared with it.
 #[derive(Debug)]
 pub(super) struct Advisor {
     context: Arc<TurnContext>,
@@ -38,15 +38,15 @@ struct TurnContext {
 #[derive(Debug, Default)]
 struct Question {
     problem: Option<Problem>,
-    /// Nobody wants to know any more.
+    /// The advisor was dropped.
     is_over: bool,
 }
 
 impl Advisor {
-    /// Begins to wait for questions. `seed` is what the search's choices are derived from.
+    /// Starts the thread, which waits for problems. `seed` is the seed of the search.
     ///
     /// # Errors
-    /// Where there can be no further thread.
+    /// The thread cannot be started.
     pub(super) fn start(seed: u64) -> std::io::Result<Advisor> {
         let context = Arc::new(TurnContext::default());
         let (tell, advice) = mpsc::channel(MAX_PENDING);
@@ -55,12 +55,12 @@ impl Advisor {
         Ok(Advisor { context, advice })
     }
 
-    /// Asks for a better order; the question before is forgotten.
+    /// Gives a problem to search; it replaces the previous one.
     pub(super) fn ask(&self, problem: Problem) {
         self.context.change(|question| question.problem = Some(problem));
     }
 
-    /// The next advice.
+    /// Resolves with the next advice.
     pub(super) async fn told(&mut self) -> Event {
         match self.advice.recv().await {
             Some(event) => event,
@@ -81,7 +81,7 @@ impl TurnContext {
         self.changed.notify_one();
     }
 
-    /// Waits for a question; `None` when there will be none.
+    /// Waits for a problem; `None` when there will be no more.
     fn next(&self) -> Option<Problem> {
         let question = self.question.lock().unwrap_or_else(PoisonError::into_inner);
         let nothing = |question: &mut Question| question.problem.is_none() && !question.is_over;
@@ -100,13 +100,13 @@ impl TurnContext {
         while let Some(problem) = self.next() {
             asked += 1;
             if let Some(advice) = self.think(&problem, seed.wrapping_add(asked), &mut memory) {
-                // Whoever is that far behind will ask again.
+                // A run that does not keep up gives a new problem later.
                 let _ = tell.try_send(advice);
             }
         }
     }
 
-    /// A better order than the present one, if one is found in time and nobody asks for something else meanwhile.
+    /// Advice with a better order than the present one, if one is found in time and no new problem arrives meanwhile.
     fn think(&self, problem: &Problem, seed: u64, memory: &mut Memory) -> Option<Event> {
         let mut search = Search::remembering(problem, seed, memory)
             .inspect_err(|error| tracing::debug!(%error, "no look ahead"))
@@ -123,20 +123,20 @@ impl TurnContext {
         }
         *memory = search.memory();
         let best = search.best();
-        // What is no number would not read back from a log.
+        // JSON has no infinity and no NaN: the log could not be read back.
         let is_usable = best.urgency_s.iter().all(|(_, seconds)| seconds.is_finite());
         let is_told = is_usable && is_worthwhile(best.end_s, best.plain_s) && !best.urgency_s.is_empty();
         is_told.then_some(Event::Advised { urgency_s: best.urgency_s, held: best.held })
     }
 }
 
-/// Whether an end, in seconds from now, is earlier than the present one by more than it costs to find and tell it. Of many goals of a millisecond
-/// no order is.
+/// Whether an end time, in seconds from now, is earlier than the present one by more than it costs to find and send it. For many goals of a
+/// millisecond each, no order is.
 fn is_worthwhile(end_s: f64, plain_s: f64) -> bool {
     plain_s - end_s > (plain_s * WORTHWHILE).max(THINKING.as_secs_f64())
 }
 
-/// Whether there is something to be gained: something runs, and two others want one kind of which there is a bounded number.
+/// Whether a search can gain anything: something runs, and two waiting tasks want a kind with a bounded number of units.
 pub(super) fn is_worth_asking(problem: &Problem) -> bool {
     let waiting = || problem.tasks.iter().filter(|task| !task.is_running);
     problem.tasks.iter().any(|task| task.is_running)
@@ -166,8 +166,8 @@ mod tests {
         }
     }
 
-    /// One arm is busy; then a short task that a long one waits for, and one that nobody waits for. Nothing is more urgent yet,
-    /// so it is served in program order: the idle one first.
+    /// The arm is busy; a long task waits for short task 2, and no task waits for task 1. No task is more urgent yet, so they are served in program
+    /// order: task 1 first.
     fn problem() -> Problem {
         let tasks = vec![
             task(0, 1.0, "Arm", &[]),

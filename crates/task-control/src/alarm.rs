@@ -1,28 +1,27 @@
-//! One timer for everything that a run does at a moment. It is set anew only where another moment comes first, so that an answer that
-//! arrives costs no timer.
+//! A single timer for all timed work of a run. It is reset only if the next deadline changes, so that an arriving answer costs no timer operation.
 
 use std::pin::Pin;
 use std::time::Instant;
 use tokio::time::Sleep;
 
-/// Rings at a moment. Made within a tokio runtime.
+/// A timer that fires at a set time. Must be created within a tokio runtime.
 #[derive(Debug)]
 pub(super) struct Alarm(Pin<Box<Sleep>>);
 
 impl Alarm {
-    /// One that rings then.
+    /// A timer that fires at this time.
     pub(super) fn at(moment: Instant) -> Alarm {
         Alarm(Box::pin(tokio::time::sleep_until(moment.into())))
     }
 
-    /// It rings then, and not before; at once where that is past.
+    /// Sets the time at which the timer fires, in place of the previous one; a past time fires at once.
     pub(super) fn set(&mut self, moment: Instant) {
         if self.0.deadline() != moment.into() {
             self.0.as_mut().reset(moment.into());
         }
     }
 
-    /// Resolves when it rings, and again until it is set anew.
+    /// Resolves when the timer fires, and again on each call until it is reset.
     pub(super) async fn rings(&mut self) {
         self.0.as_mut().await;
     }
@@ -39,7 +38,7 @@ mod tests {
         let mut alarm = Alarm::at(began + Duration::from_secs(60));
         let soon = began + Duration::from_millis(20);
         alarm.set(soon);
-        // Waited for twice, and given up once.
+        // Awaited twice, the first time with a timeout.
         let _ = tokio::time::timeout(Duration::from_millis(1), alarm.rings()).await;
         alarm.set(soon);
         alarm.rings().await;

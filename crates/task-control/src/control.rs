@@ -1,6 +1,6 @@
-//! A run's ear: a Unix socket in the runtime directory of its system, `RUN.control`, over which `ratn control` pauses it, lets it go on, lets
-//! one PIA begin, or ends it, and sets breakpoints, `ratn status` asks what it is doing, `ratn signal` and `ratn answer` send it what its states wait for. One
-//! word or [`Message`] (in JSON) per line; each is answered by one line.
+//! The control socket of a run, a Unix socket `RUN.control` in the runtime directory of its system. `ratn control` pauses the run, resumes it, lets
+//! one PIA begin, aborts it, and sets breakpoints; `ratn status` asks for its status; `ratn signal` and `ratn answer` send what its states wait for.
+//! The protocol is a word or a [`Message`] (in JSON) per line, each answered by one line.
 
 mod find;
 mod service;
@@ -25,58 +25,58 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-/// Words that the run has not been told yet.
+/// Maximum number of requests that the run has not received yet.
 const MAX_PENDING: usize = 16;
-/// Longer lines are no words of control.
+/// Longer lines are not control words.
 const MAX_LINE_BYTES: u64 = 64;
-/// Longer lines are no messages.
+/// Longer lines are not messages.
 const MAX_MESSAGE_BYTES: u64 = 64 << 10;
-/// A run that does not answer for so long does not listen.
+/// A connection whose request the run has not answered after this time is closed.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
-/// Who asks waits longer than the run has time to answer: then what was not answered is not taken later either.
+/// The client waits longer than the run's deadline: a request that was not answered by then is not performed later either.
 const PATIENCE: Duration = Duration::from_secs(6);
-/// Whoever has connected says its line at once.
+/// A new connection has this long to send its line.
 const LINE_DEADLINE: Duration = Duration::from_secs(1);
-/// So many connections are served beside each other; the next one waits until the line of one of them is late.
+/// Maximum number of simultaneous connections; the next one waits until one of them ends or times out.
 const MAX_CONNECTIONS: usize = 32;
 const DONE: &str = "ok";
-/// The word that asks what the run is doing.
+/// The word that requests the status of the run.
 const STATUS: &str = "status";
-/// No run has so much to say of itself.
+/// Maximum size of a status.
 const MAX_STATUS_BYTES: u64 = 4 << 20;
 
-/// What a run is doing.
+/// The status of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunStatus {
-    /// Its id.
+    /// The id of the run.
     pub run: String,
-    /// Its task's name.
+    /// The name of the task.
     pub task: String,
-    /// How it is executed.
+    /// The execution mode.
     pub mode: Mode,
     /// The event log.
     pub log: PathBuf,
-    /// The robot's seconds since it began.
+    /// Time since the run began, in seconds of the robot's time.
     pub at_s: f64,
-    /// Its share of what several runs need.
+    /// Its share (weight) of resources that several runs compete for.
     #[serde(default = "usual_share")]
     pub share: f64,
-    /// In how many seconds of wall time it is due, if it is; negative where that has passed.
+    /// Wall time until its due date in seconds, if it has one; negative if overdue.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub due_in_s: Option<f64>,
     /// Whether the user has paused it.
     pub paused: bool,
-    /// How many states have ended for good.
+    /// The number of states that have retired.
     pub ended: u64,
-    /// The states that are under way, those that began first first.
+    /// The states under way, in the order in which they began.
     pub under_way: Vec<UnderWay>,
-    /// What the states wait for that have not begun, a sentence each; none in HSM mode. As many as are said at most.
+    /// Why states have not begun, one sentence each, up to a maximum number; empty in HSM mode.
     #[serde(default)]
     pub waits: Vec<String>,
-    /// The states that wait by themselves, and for what.
+    /// The states that wait for something themselves, with what they wait for.
     #[serde(default)]
     pub awaits: Vec<Awaiting>,
-    /// Before which states it pauses, by their paths without visits.
+    /// The breakpoints: paths of states without visits.
     #[serde(default)]
     pub breakpoints: Vec<String>,
 }
@@ -88,57 +88,57 @@ fn usual_share() -> f64 {
 /// A state that waits for a time, a condition, a signal or an answer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Awaiting {
-    /// Its path with visits.
+    /// The path of the state with visits.
     pub path: String,
     /// What it waits for.
     #[serde(flatten)]
     pub awaited: Awaited,
-    /// Until then at the most, in the robot's seconds since the run began.
+    /// The end of the wait at the latest, in seconds of the robot's time since the run began.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub until_s: Option<f64>,
 }
 
-/// What a run is sent by somebody: what its states wait for, or where it shall stop.
+/// A message from a client to a run: something that its states wait for, or a breakpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "message", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Message {
-    /// A signal. It ends the wait of one state: of one that waits for a signal of this name, else of the next that will.
+    /// A signal. It ends the wait of one state: of one that waits for a signal of this name, else of the next one that will.
     Signal {
         /// The run: its id, the name of its task, or [`ANY_RUN`].
         run: String,
-        /// The signal's name.
+        /// The name of the signal.
         signal: String,
-        /// What is sent with it.
+        /// The value sent with it.
         value: Value,
     },
     /// An answer.
     Answer {
         /// The run: its id, the name of its task, or [`ANY_RUN`].
         run: String,
-        /// The path of the state that asks, with or without visits; needed where several do.
+        /// The path of the asking state, with or without visits; required if several states ask.
         state: Option<String>,
-        /// One of its choices.
+        /// One of the question's choices.
         choice: String,
     },
     /// A breakpoint: the run is paused before a PIA of a state, or inside of it, begins.
     Breakpoint {
         /// The run: its id, the name of its task, or [`ANY_RUN`].
         run: String,
-        /// The path of the state, with or without visits; none stands for all breakpoints that there are.
+        /// The path of the state, with or without visits; `None` for all existing breakpoints.
         state: Option<String>,
-        /// Whether it is set, else it is taken away.
+        /// True to set the breakpoint, false to remove it.
         set: bool,
     },
 }
 
 impl Message {
-    /// The run that it is for.
+    /// The run that the message is for.
     pub(crate) fn run(&self) -> &str {
         let (Message::Signal { run, .. } | Message::Answer { run, .. } | Message::Breakpoint { run, .. }) = self;
         run
     }
 
-    /// The message, if its names and its value are such as any client may send.
+    /// Checks that the names and the value are within the limits for every client.
     fn checked(self) -> Result<Message, Malformed> {
         match &self {
             Message::Signal { run, signal, value } => {
@@ -160,35 +160,35 @@ impl Message {
     }
 }
 
-/// The run that is under way, where it is the only one.
+/// Stands for the only run under way.
 pub const ANY_RUN: &str = "-";
 
 impl RunStatus {
-    /// More sentences are not said.
+    /// Maximum number of `waits`.
     pub(crate) const MOST_WAITS: usize = 256;
 }
 
-/// What somebody wants of a run.
+/// A request to a run.
 #[derive(Debug)]
 pub(crate) enum Asked {
-    /// It shall do something.
+    /// Control: an event for the executive.
     Told(Box<Event>),
-    /// It shall say what it is doing.
+    /// Asks for the status.
     Status(oneshot::Sender<RunStatus>),
-    /// Something that its states wait for, or may. It says what becomes of it once that is in its log, or why nothing does.
+    /// A message for a state. The reply is sent when the message is in the run's log; an error says why it is not accepted.
     Message(Message, oneshot::Sender<Result<String, String>>),
 }
 
-/// What a run can be told.
+/// A control word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Word {
-    /// No further PIA begins; states that run go on.
+    /// No further PIA begins; states under way go on.
     Pause,
     /// PIAs may begin again.
     Resume,
     /// One PIA begins, then the run pauses again.
     Step,
-    /// The run ends: motions stop and hold, everything is given back.
+    /// The run ends: motions stop and hold, all leases are released.
     Abort,
 }
 
@@ -214,7 +214,7 @@ impl Word {
     }
 }
 
-/// Listens until dropped.
+/// Listens until it is dropped.
 #[derive(Debug)]
 pub(crate) struct Control {
     words: mpsc::Receiver<Asked>,
@@ -223,15 +223,15 @@ pub(crate) struct Control {
 }
 
 impl Control {
-    /// Listens in `directory` for the run of this id. A socket that is there already is its own, of before it was killed.
+    /// Listens in `directory` for the run with this id. An existing socket was left by the same run when it was killed, and is replaced.
     ///
     /// # Errors
-    /// Where the socket cannot be made, for example because its path is too long for one.
+    /// The socket cannot be created, for example because its path is too long.
     pub(crate) fn listen(directory: &Path, run: &str) -> std::io::Result<Control> {
         Control::listen_with(directory, run, ANSWER_DEADLINE)
     }
 
-    /// Who is not answered until the deadline is given up.
+    /// A connection that is not answered before the deadline is closed.
     fn listen_with(directory: &Path, run: &str, deadline: Duration) -> std::io::Result<Control> {
         let path = find::socket(directory, run);
         match std::fs::remove_file(&path) {
@@ -241,7 +241,7 @@ impl Control {
         let listener = UnixListener::bind(&path)?;
         let (tell, words) = mpsc::channel(MAX_PENDING);
         let end = CancellationToken::new();
-        // Clients in other folders read where it is.
+        // The path is published to clients in other working directories.
         let to = std::path::absolute(directory)?;
         let (server, until) = (RunServer::of(&to, run, tell.clone()), end.clone());
         tokio::spawn(async move {
@@ -254,7 +254,7 @@ impl Control {
         Ok(Control { words, path, _end: end.drop_guard() })
     }
 
-    /// As [`Control::listen`]; a run goes on without it where it cannot be.
+    /// Like [`Control::listen`]; if that is impossible, the run goes on without a control socket.
     pub(crate) fn listen_if_possible(directory: &Path, run: &str, messages: &Messages) -> Option<Control> {
         let listening = Control::listen(directory, run);
         if let Err(error) = &listening {
@@ -264,7 +264,7 @@ impl Control {
         listening.ok()
     }
 
-    /// What the run is asked next.
+    /// The next request to the run.
     pub(crate) async fn asked(&mut self) -> Asked {
         match self.words.recv().await {
             Some(event) => event,
@@ -280,7 +280,7 @@ impl Drop for Control {
 }
 
 async fn accept(listener: UnixListener, tell: mpsc::Sender<Asked>, deadline: Duration) {
-    // Whoever is slow keeps nobody else waiting, and is given up after a while. What it sent is not taken then.
+    // A slow client keeps no other client waiting: its connection is closed at the deadline, and its request is then not performed.
     let mut connections = JoinSet::new();
     loop {
         tokio::select! {
@@ -297,7 +297,7 @@ async fn accept(listener: UnixListener, tell: mpsc::Sender<Asked>, deadline: Dur
     }
 }
 
-/// The line that somebody says, as bytes: a limit may lie within a character.
+/// Reads the line that a client sends, as bytes: a limit may lie within a character.
 async fn line_of(reader: ReadHalf<'_>) -> std::io::Result<Vec<u8>> {
     let mut line = Vec::new();
     let mut lines = BufReader::new(reader.take(MAX_LINE_BYTES));
@@ -312,7 +312,7 @@ async fn line_of(reader: ReadHalf<'_>) -> std::io::Result<Vec<u8>> {
 async fn hear(mut stream: UnixStream, tell: &mpsc::Sender<Asked>) -> std::io::Result<()> {
     let (reader, mut writer) = stream.split();
     let line = tokio::time::timeout(LINE_DEADLINE, line_of(reader)).await.map_err(Error::other)??;
-    // What is no text in UTF-8 is no word of control.
+    // Bytes that are not UTF-8 are not a control word.
     let line = std::str::from_utf8(&line).unwrap_or_default();
     const BEHIND: &str = "the run is too far behind";
     let word = Word::ALL.into_iter().find(|word| word.text() == line.trim());
@@ -350,10 +350,10 @@ fn read(line: &str) -> Result<Message, String> {
     message.checked().map_err(|malformed| malformed.to_string())
 }
 
-/// Tells a run of the system in `directory`: of this id or this task, or [`ANY_RUN`].
+/// Sends a control word to a run of the system in `directory`: the run with this id or this task, or [`ANY_RUN`].
 ///
 /// # Errors
-/// Where no run listens, it is not known which is meant, or it does not take the word.
+/// No run listens, it is unclear which run is meant, or the run rejects the word.
 pub async fn tell(directory: &Path, run: &str, word: Word) -> std::io::Result<()> {
     match say(&find::meant(directory, run).await?, word.text(), MAX_LINE_BYTES).await?.as_str() {
         DONE => Ok(()),
@@ -365,11 +365,11 @@ fn one_line(text: &str) -> String {
     text.replace(['\n', '\r'], " ")
 }
 
-/// Sends the run that a message is for, of the system in `directory`, something that its states wait for, or may; what becomes of it. It is in the run's log,
-/// on the disk, when this returns. Where it fails on the way, the run may have got it all the same, and the error says so.
+/// Sends a message to its run, of the system in `directory`, and returns what the run does with it. The message is in the run's log on disk when this
+/// returns. After an error in transit the run may have received the message; the error says so.
 ///
 /// # Errors
-/// Where no run listens, it is not known which is meant, or it does not take that.
+/// No run listens, it is unclear which run is meant, or the run rejects the message.
 pub async fn send(directory: &Path, message: &Message) -> std::io::Result<String> {
     let line = serde_json::to_string(message)?;
     if line.len() as u64 >= MAX_MESSAGE_BYTES {
@@ -400,7 +400,7 @@ pub fn is_uncertain(error: &Error) -> bool {
     matches!(error.kind(), TimedOut | UnexpectedEof | ConnectionReset | BrokenPipe)
 }
 
-/// Says a word at a run's socket and hears the line that answers it.
+/// Sends a line to the socket of a run and reads the answer, one line.
 async fn say(socket: &Path, word: &str, most: u64) -> std::io::Result<String> {
     let asking = async {
         let mut stream = UnixStream::connect(socket).await?;
@@ -424,7 +424,7 @@ mod tests {
     #[tokio::test]
     async fn words_arrive_as_events_in_order() -> anyhow::Result<()> {
         let place = tempfile::tempdir()?;
-        // One of a run that was killed.
+        // Left by a run that was killed.
         std::fs::write(find::socket(place.path(), RUN), "")?;
         let mut control = Control::listen(place.path(), RUN)?;
         for word in [Word::Pause, Word::Step] {
@@ -475,7 +475,7 @@ mod tests {
         });
         assert_eq!(status(place.path(), ANY_RUN).await?, Some(doing));
         answering.await?;
-        // The socket of a run that was killed.
+        // The socket of a killed run.
         std::fs::write(find::socket(place.path(), RUN), "")?;
         assert_eq!(status(place.path(), ANY_RUN).await?, None);
         Ok(())
@@ -527,7 +527,7 @@ mod tests {
     async fn a_message_arrives_whatever_characters_it_has() -> anyhow::Result<()> {
         let place = tempfile::tempdir()?;
         let mut control = Control::listen(place.path(), RUN)?;
-        // Whichever byte the first limit falls on.
+        // The first limit falls on each byte of a character.
         for before in 0..8 {
             let value = Value::String("x".repeat(before) + &"\u{1f916}\u{fc}".repeat(30));
             let message = Message::Signal { run: ANY_RUN.to_owned(), signal: "go".to_owned(), value };
@@ -565,7 +565,7 @@ mod tests {
         let message = Message::Signal { run: ANY_RUN.to_owned(), signal: "go".to_owned(), value: Value::Null };
         let Err(error) = send(place.path(), &message).await else { anyhow::bail!("nobody answered") };
         assert!(error.to_string().contains("not known whether"), "{error}");
-        // It is still there to be taken; the run sees that nobody waits for it any more.
+        // The request is still queued; the run sees that its client no longer waits.
         assert!(matches!(control.asked().await, Asked::Message(_, say) if say.is_closed()));
         Ok(())
     }

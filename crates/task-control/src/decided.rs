@@ -1,6 +1,7 @@
-//! How a call is made that has been decided: what it says has happened or is over (a commit, an operation, a lease that goes back, a withdrawal), so nobody
-//! can do without it. It is made again while it is not answered, for 30 s while it is refused for load, and only while the run's session has what it had: what a run has
-//! lost others may have got and changed. That is asked before every try, as a try may hang for longer than a session lives.
+//! Repeats a call whose effect has been decided (a commit, an operation, the release of a lease, a withdrawal), so that the run cannot do without it.
+//! The call is repeated while it is not answered, for 30 s while it is refused because of load, and only while the run's session keeps its resources:
+//! others may have acquired and changed what a run has lost. This is checked before every try, because a try may hang for longer than a session
+//! lives.
 
 use crate::performer::Overtaken;
 use crate::record::said;
@@ -9,30 +10,29 @@ use ratn_worker::session::Trust;
 use std::fmt;
 use std::time::Duration;
 
-/// Tries of a call whose server is not there, where the run does not wait for that one as long as it waits for the resource manager: the pauses come
-/// to 4 s.
+/// Maximum number of tries while a server cannot be reached, unless the run waits for it as long as for the resource manager: the pauses total 4 s.
 const TRIES: u32 = 16;
 
-/// How long a run asks for what a server refuses for load. A bound may stay reached: the resources that a run has made itself nobody takes away.
+/// How long the run repeats a call that is refused because of load. A limit may stay reached: nobody removes the resources that a run has created itself.
 pub(super) const REFUSED_PATIENCE: Duration = Duration::from_secs(30);
 
-/// How long a server is waited for that does not answer.
+/// How long to wait for a server that does not answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Unanswered {
-    /// For 16 tries.
+    /// For [`TRIES`] tries.
     GivenUp,
     /// As long as the session is kept.
     Waits,
 }
 
-/// Why it is not done.
+/// Why a call was not done.
 #[derive(Debug, Clone)]
 pub(super) enum Undone {
-    /// The session was lost before. Whether the last try was performed is not known where one was made.
+    /// The session was lost before. If there was a last try, it is unknown whether it was performed.
     Lost,
-    /// Others have changed what it is made of.
+    /// Others have changed the facts that the call is based on.
     Overtaken(Overtaken),
-    /// It was refused, or not answered.
+    /// The call was refused, or not answered.
     Failed(CallError),
 }
 
@@ -49,11 +49,11 @@ impl fmt::Display for Undone {
     }
 }
 
-/// Whoever says whether the run has what it had.
+/// Knows whether the run has kept its session and resources.
 pub(super) trait Keeps: Clone {
-    /// Whether it has. Waits while that is not known.
+    /// Whether the run has kept them. Waits while this is unknown.
     async fn is_kept(&mut self) -> bool;
-    /// Returns once it has not.
+    /// Resolves when the run has lost them.
     async fn gone(&self);
 }
 
@@ -67,7 +67,7 @@ impl Keeps for Trust {
     }
 }
 
-/// Makes a call until it is done, refused for good, or must not be made any more.
+/// Makes a call until it is done, finally refused, or must not be made any more.
 ///
 /// # Errors
 /// [`Undone`].
@@ -123,7 +123,7 @@ mod tests {
     use tonic::{Code, Status};
     use tonic_types::{ErrorDetails, StatusExt};
 
-    /// Has what it had until its token is cancelled; counts how often it is asked.
+    /// Keeps its resources until its token is cancelled; counts how often it is asked.
     #[derive(Clone, Default)]
     struct Kept(tokio_util::sync::CancellationToken, Rc<Cell<u32>>);
 
@@ -160,7 +160,7 @@ mod tests {
         };
         assert!(matches!(insist(&kept, Unanswered::Waits, silent).await, Err(Undone::Lost)));
         assert_eq!((calls.get(), kept.1.get()), (2, 3));
-        // A try that hangs is not waited for.
+        // A hanging try is abandoned.
         let kept = Kept::default();
         let hangs = || {
             kept.0.cancel();
@@ -180,7 +180,7 @@ mod tests {
         let mut long: Vec<_> = (0..2 * TRIES).map(|_| Err(busy())).collect();
         long.push(Ok(7));
         assert!(matches!(insisted(Unanswered::GivenUp, long).await, Ok(7)));
-        // A bound that stays reached is named.
+        // A limit that stays reached is reported.
         let short = Duration::from_millis(100);
         let full = &mut || std::future::ready(Err::<(), _>(busy()));
         let refused = insist_for(short, &Kept::default(), Unanswered::Waits, full).await;

@@ -1,4 +1,4 @@
-//! What a run that was killed has left: its event log, and a checkpoint of it. Reading touches nothing.
+//! What a killed run has left: its event log and a checkpoint. Reading changes nothing.
 
 use super::checkpoint::{self, Checkpoint};
 pub use super::replay::ReplayError;
@@ -13,18 +13,18 @@ use std::sync::Arc;
 /// Why a run cannot be resumed.
 #[derive(Debug, thiserror::Error)]
 pub enum HistoryError {
-    /// It does not read.
+    /// The log cannot be read.
     #[error(transparent)]
     Log(#[from] LogError),
-    /// It does not follow from the task.
+    /// The log does not match the task.
     #[error(transparent)]
     Replay(#[from] ReplayError),
-    /// Its checkpoint forbids to go on.
+    /// The checkpoint forbids resuming.
     #[error(transparent)]
     Checkpoint(#[from] checkpoint::FileError),
 }
 
-/// The log of a run that is gone on with.
+/// The log of a run that is being resumed.
 pub struct History {
     path: PathBuf,
     /// The event `started`.
@@ -33,28 +33,28 @@ pub struct History {
 }
 
 impl History {
-    /// Of a log. Its writer is whoever asks, so that nobody else goes on with it. What is found on the way goes to `messages`.
+    /// The history in a log. The caller holds the log's writer, so that nobody else resumes the run. Findings are sent to `messages`.
     ///
     /// # Errors
-    /// Where it is no event log.
+    /// The file is not an event log.
     pub fn of(writer: &LogWriter, messages: Messages) -> Result<History, LogError> {
         let path = writer.path().to_owned();
         let first = log::first(&path)?;
         Ok(History { path, first, messages })
     }
 
-    /// The task file that it names.
+    /// The task file that the log names.
     pub fn task(&self) -> Option<PathBuf> {
         let origin = self.started()?.0;
         (!origin.file.is_empty()).then(|| PathBuf::from(&origin.file))
     }
 
-    /// The state at which the run began, where that was not the first.
+    /// The state at which the run began, if it was not the first.
     pub fn from(&self) -> Option<String> {
         self.started()?.0.from.clone()
     }
 
-    /// How the run is executed, and what its random choices are derived from.
+    /// The execution mode, and the seed of the run's random choices.
     pub(crate) fn mode_and_seed(&self) -> (Mode, u64) {
         match &self.first.entry {
             LogEntry::Event(Event::Started { mode, seed, .. }) => (*mode, *seed),
@@ -62,10 +62,10 @@ impl History {
         }
     }
 
-    /// Where the run stands: by its newest checkpoint and what is behind it, else by the whole log.
+    /// The state of the run, from its newest checkpoint and the lines after it, else from the whole log.
     ///
     /// # Errors
-    /// Where the log is not of this program and this version.
+    /// The log does not match this program or this version.
     pub(crate) fn replay(&self, program: &Arc<Program>) -> Result<(Replayed, Log), HistoryError> {
         replay::check(program, &self.first)?;
         let Some(checkpoint) = self.checkpoint()? else {
@@ -86,22 +86,22 @@ impl History {
         }
     }
 
-    /// As [`History::replay`], without a checkpoint.
+    /// Like [`History::replay`], without a checkpoint.
     ///
     /// # Errors
-    /// As there.
+    /// The same as there.
     pub(crate) fn replay_whole(&self, program: &Arc<Program>) -> Result<(Replayed, Log), HistoryError> {
         let whole = log::read(&self.path)?;
         Ok((replay::replay(program, &whole.lines)?, whole))
     }
 
-    /// What is to be said of a checkpoint that is not used.
+    /// Reports that a checkpoint is not used.
     pub(crate) fn say(&self, reason: &dyn std::fmt::Display) {
         let path = checkpoint::path_of(&self.path);
         self.messages.say(format_args!("{}: not used, the whole log is replayed: {reason}", path.display()));
     }
 
-    /// Where what people read goes.
+    /// The receiver of messages for people.
     pub(crate) fn messages(&self) -> &Messages {
         &self.messages
     }

@@ -1,24 +1,24 @@
-//! The wish of a user that a run ends, as something that every part of it can wait for.
+//! The user's request that a run ends, for which every part of the run can wait.
 
 use tokio::sync::watch;
 
-/// How often the user has asked a run to end: the first time in order, the second time at once.
+/// How often the user has asked a run to end: the first time it ends in order, the second time at once.
 #[derive(Debug, Clone)]
 pub struct Interrupt(watch::Receiver<u32>);
 
-/// Asks the runs to end that were given its [`Interrupt`].
+/// Asks the runs that share its [`Interrupt`] to end.
 #[derive(Debug)]
 pub struct Interrupter(watch::Sender<u32>);
 
 impl Interrupter {
-    /// Asks once more.
+    /// Asks again.
     pub fn ask(&self) {
         self.0.send_modify(|times| *times += 1);
     }
 }
 
 impl Interrupt {
-    /// One, and who asks over it. Without anybody who asks, a run goes on to its end.
+    /// A pair of asker and receiver. If the asker is dropped, the run goes on to its end.
     pub fn new() -> (Interrupter, Interrupt) {
         let (asks, times) = watch::channel(0);
         (Interrupter(asks), Interrupt(times))

@@ -1,5 +1,5 @@
-//! What event logs of earlier runs teach about a task: how long its states take, and which way its conditions, loops and
-//! actions go. A pure fold over lines; only what has really happened counts, so nothing that was squashed, cancelled or crashed.
+//! Learns from event logs of earlier runs of a task: the durations of its states, and the outcomes of its conditions, loops and actions. A pure fold
+//! over lines; work that was squashed, cancelled or crashed does not count.
 
 use crate::messages::Messages;
 use ratn_event_log::{self as log, without_visits};
@@ -9,10 +9,10 @@ use ratn_model::time::Timestamp;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// More logs than this in a folder are too many to read before a run; the newest by name count.
+/// Maximum number of logs read from a folder before a run; the last ones by name are read.
 const MAX_LOGS: usize = 256;
 
-/// An event log that was named cannot teach anything.
+/// Why nothing can be learned from a given event log.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot learn from {}: {reason}", path.display())]
 pub struct LearnError {
@@ -20,17 +20,17 @@ pub struct LearnError {
     reason: String,
 }
 
-/// Adds up over logs.
+/// Statistics over several logs.
 #[derive(Debug, Default)]
 pub struct LearnedStatistics {
-    /// By state: how many attempts ended with an outcome, and how long they took together.
+    /// By state: the number of attempts with an outcome, and their total duration in seconds.
     durations: BTreeMap<String, (u32, f64)>,
-    /// By state and outcome: how often.
+    /// By state and outcome: the number of occurrences.
     outcomes: BTreeMap<String, BTreeMap<String, u32>>,
 }
 
 impl LearnedStatistics {
-    /// Adds what one log tells.
+    /// Adds one log.
     pub fn add(&mut self, lines: &[LogLine]) {
         let mut fold = Fold::default();
         for line in lines {
@@ -49,7 +49,7 @@ impl LearnedStatistics {
         }
     }
 
-    /// Means and shares.
+    /// Computes means and fractions.
     pub fn learned(&self) -> Learned {
         let mean = |(path, (count, total_s)): (&String, &(u32, f64))| (path.clone(), total_s / f64::from(*count));
         let shares = |(path, counts): (&String, &BTreeMap<String, u32>)| {
@@ -68,22 +68,22 @@ impl LearnedStatistics {
     }
 }
 
-/// One log.
+/// The fold over one log.
 #[derive(Debug, Default)]
 struct Fold {
-    /// Without visits.
+    /// Paths without visits.
     paths: BTreeMap<InstanceId, String>,
     started: BTreeMap<InstanceId, (u32, Timestamp)>,
     finished: BTreeMap<InstanceId, String>,
     retired: BTreeSet<InstanceId>,
-    /// States of which decisions are told: their outcomes are not counted again.
+    /// States with logged decisions: their outcomes are not counted again.
     decided: BTreeSet<String>,
 }
 
 impl Fold {
     fn event(&mut self, statistics: &mut LearnedStatistics, at: Timestamp, event: &Event) {
         match event {
-            // With its first result it is done for whoever waits.
+            // An anytime action counts as done at its first result, which its users wait for.
             Event::Finished { instance, attempt, .. } | Event::Improved { instance, attempt, .. } => {
                 let Some((_, began)) = self.started.remove(instance).filter(|started| started.0 == *attempt) else {
                     return;
@@ -95,7 +95,7 @@ impl Fold {
                 }
             }
             Event::Crashed { instance, .. } => drop(self.started.remove(instance)),
-            // How long it took is not known of what was under way.
+            // The duration of what was under way is unknown.
             Event::Resumed { .. } => self.started.clear(),
             _ => {}
         }
@@ -110,7 +110,7 @@ impl Fold {
             }
             Command::Note(Note::Decided { path, decision, .. }) => {
                 let path = without_visits(path);
-                // The number of elements of a collection is no outcome.
+                // The number of elements of a collection is not an outcome.
                 if decision.parse::<u64>().is_err() {
                     statistics.came(&path, decision);
                 }
@@ -125,10 +125,10 @@ impl Fold {
     }
 }
 
-/// Reads the logs that are named, and those in folders that are named, as far as they are of the task.
+/// Reads the given logs, and those in the given folders that are of the task.
 ///
 /// # Errors
-/// A log that is named and does not read. In a folder, what is no log of the task is left out.
+/// A given log cannot be read. In a folder, files that are not logs of the task are skipped.
 pub fn from_files(named: &[PathBuf], task: &str, messages: &Messages) -> Result<Learned, LearnError> {
     let mut statistics = LearnedStatistics::default();
     let mut used = 0_usize;
@@ -166,7 +166,7 @@ fn of_task(lines: &[LogLine], name: &str) -> bool {
     matches!(first, Some(LogEntry::Event(Event::Started { task, .. })) if task == name)
 }
 
-/// Files that are named like event logs, the last of them by name.
+/// The files that are named like event logs, the last ones by name.
 fn logs_in(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
     let mut logs = Vec::new();
     for entry in std::fs::read_dir(folder)? {
@@ -203,7 +203,7 @@ mod tests {
     fn durations_are_means_and_outcomes_are_shares_of_what_was_real() {
         let mut statistics = LearnedStatistics::default();
         statistics.add(&lines(LOOK));
-        // The second visit was squashed: neither its duration nor its outcome is known.
+        // The second visit was squashed: neither its duration nor its outcome counts.
         let learned = statistics.learned();
         assert_eq!(learned.durations_s, [("all/look".to_owned(), 2.0)].into());
         let shares: Vec<String> = learned.outcomes.iter().map(|(path, shares)| format!("{path} {shares:?}")).collect();

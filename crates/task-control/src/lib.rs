@@ -1,13 +1,12 @@
-//! Task control as a library: runs a task on a system that is up, follows it, and goes on with it after a crash.
+//! Task control as a library: runs a task on a running system, monitors it, and resumes it after a crash.
 //!
-//! It owns the shell around `ratn-executive`: it performs the executive's commands over gRPC, brings the answers back as events, and
-//! writes both to the event log before anything that cannot be undone happens ([`shell`]). It owns the socket over which a run is
-//! paused, ended or asked what it does ([`control`]), the checkpoints of a run ([`checkpoint`]), what a killed run has left
-//! ([`history`]), and what logs teach about a task ([`learn`]).
+//! It contains the shell around `ratn-executive`, which performs the executive's commands over gRPC, returns the answers as events, and writes both
+//! to the event log before anything irreversible happens ([`shell`]). It also contains the control socket of a run ([`control`]), checkpoints
+//! ([`checkpoint`]), the history of a killed run ([`history`]), and learning from logs ([`learn`]).
 //!
-//! It reads no command line, no config and no environment, starts no processes and prints nothing: a caller says where the system is
-//! ([`shell::Place`]), where what people read goes ([`Messages`]), and when a run is to end ([`Interrupt`]). Reports are made of the
-//! event log by `ratn-report`.
+//! It reads no command line, config or environment, starts no processes and prints nothing: the caller passes the place of the system
+//! ([`shell::Place`]), a receiver of messages for people ([`Messages`]), and the request to end a run ([`Interrupt`]). `ratn-report` makes reports
+//! from the event log.
 
 mod advisor;
 mod alarm;
@@ -40,16 +39,16 @@ pub use performer::{RUN_KIND, claim};
 
 use ratn_worker::endpoint::Endpoint;
 
-/// Where the daemons are that task control speaks with; everyone else is found by leases.
+/// The endpoints of the daemons that task control calls; all others are found by leases.
 #[derive(Debug, Clone)]
 pub struct Endpoints {
-    /// The resource manager's.
+    /// The endpoint of the resource manager.
     pub resource_manager: Endpoint,
-    /// The world pool's.
+    /// The endpoint of the world pool.
     pub world_pool: Endpoint,
 }
 
-/// An error that came before anything was started.
+/// An error that occurred before anything was started.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub struct NotStarted(pub String);

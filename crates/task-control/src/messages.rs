@@ -1,19 +1,19 @@
-//! Where what people read of a run goes.
+//! Messages about a run for people.
 
 use std::fmt::{self, Display};
 use std::sync::Arc;
 
-/// Takes lines for people, one or several at once: a terminal, a window, or nobody. Nothing depends on them.
+/// Receives lines for people, one or several at a time: a terminal, a window, or nothing. Nothing depends on them.
 #[derive(Clone)]
 pub struct Messages(Arc<dyn Fn(&str) + Send + Sync>);
 
 impl Messages {
-    /// Gives what is said to `take`, from any thread: a line, or several with line breaks between them.
+    /// Calls `take` with each message, from any thread: a line, or several separated by line breaks.
     pub fn to(take: impl Fn(&str) + Send + Sync + 'static) -> Messages {
         Messages(Arc::new(take))
     }
 
-    /// Nobody reads them.
+    /// Discards all messages.
     pub fn nowhere() -> Messages {
         Messages::to(|_| {})
     }

@@ -1,9 +1,8 @@
-//! What is otherwise in the world pool than a run knows: what others commit while it runs, and what expires.
+//! Changes of the world pool from outside of a run: commits of others while it runs, and facts that expire.
 //!
-//! The executive has a mirror of the root, in which its own commits are real as soon as it decides them. The pool tells of every
-//! revision, the run's own among them, in the order in which it made them; between one that is decided and the word of it, others
-//! may have come first. So a fact that a revision writes is, to the run, what the pool says with the run's own commits on top of
-//! which the pool has not told yet: where the mirror has it otherwise, the executive is told. Pure.
+//! The executive has a mirror of the root, in which its own commits are real as soon as it decides them. The pool reports every revision, including
+//! the run's own, in the order of commits; other commits may come between a decision and its report. So the run's view of a fact that a revision
+//! writes is the value in the pool with the run's own unreported commits applied on top: where the mirror differs, the executive is told. Pure.
 
 use super::record::Decided;
 use ratn_executive::protocol::Event;
@@ -13,19 +12,19 @@ use ratn_proto::types::WorldChange;
 use ratn_world::world::{World, increased};
 use std::collections::{BTreeMap, VecDeque};
 
-/// The run's own commits that the pool has not told of yet, the oldest first, by id.
+/// The run's own commits that the pool has not reported yet, oldest first, by id.
 #[derive(Debug, Default)]
 pub(super) struct Outside {
     pending: VecDeque<(String, Vec<Change>)>,
 }
 
 impl Outside {
-    /// The run has decided this.
+    /// The run has decided this commit.
     pub(super) fn decided(&mut self, run: &str, decided: &Decided) {
         self.pending.push_back((decided.id(run), decided.changes.clone()));
     }
 
-    /// The pool tells of a revision: what the executive has to be told, if anything.
+    /// The pool reports a revision. Returns the event for the executive, if it has to be told.
     pub(super) fn told(&mut self, change: WorldChange, mirror: &World) -> Option<Event> {
         if let Some(place) = self.pending.iter().position(|(id, _)| *id == change.commit) {
             self.pending.drain(..=place);
@@ -41,13 +40,13 @@ impl Outside {
         (!facts.is_empty()).then_some(Event::WorldChanged { revision: change.revision, facts })
     }
 
-    /// A fact with what the run's own commits will make of it.
+    /// The value of a fact with the run's own unreported commits applied.
     fn with_pending(&self, key: &FactKey, mut value: Option<Value>) -> Option<Value> {
         for change in self.pending.iter().flat_map(|(_, changes)| changes) {
             match change {
                 Change::Set { fact, value: set } if fact == key => value = Some(set.clone()),
                 Change::Delete { pattern } if pattern.matches(key) => value = None,
-                // What is no number any more will be refused; that is said then.
+                // An increase of a value that is not a number will be refused and reported then.
                 Change::Increase { fact, by } if fact == key => {
                     value = increased(fact, value.as_ref(), *by).ok().or(value);
                 }
@@ -58,7 +57,7 @@ impl Outside {
     }
 }
 
-/// All that is otherwise in a root than in a mirror, where both should be the same.
+/// All differences of a root from a mirror that should be equal to it.
 pub(super) fn differences(root: &World, mirror: &World) -> Vec<(FactKey, Option<Value>)> {
     let otherwise = root.iter().filter(|(key, fact)| mirror.get(key) != Some(&fact.value));
     let gone = mirror.iter().filter(|(key, _)| root.get(key).is_none());
@@ -96,7 +95,7 @@ mod tests {
             Bench { outside: Outside::default(), mirror: world.clone(), pool: world, commits: 0 }
         }
 
-        /// The run decides; the pool will hear of it.
+        /// The run decides a commit; the pool receives it later.
         fn decides(&mut self, changes: &[Change]) -> (String, Vec<Change>) {
             self.commits += 1;
             let revision = self.mirror.apply(changes).unwrap_or_default();
@@ -108,7 +107,7 @@ mod tests {
             (decided.id("run"), changes.to_vec())
         }
 
-        /// The pool commits and tells of it; the names of the facts of which the executive hears.
+        /// The pool commits and reports; returns the names of the facts of which the executive is told.
         fn commits(&mut self, (id, changes): (String, Vec<Change>)) -> Vec<String> {
             let written = self.pool.written_by(None, &changes).unwrap_or_default();
             let revision = self.pool.write(&written);

@@ -1,4 +1,4 @@
-//! What a run is doing, one line per node that starts or ends, for whoever reads them.
+//! The progress of a run for people: one line per node that starts or ends.
 
 use crate::control::Awaiting;
 use ratn_executive::protocol::{Awaited, Command, Event, Note};
@@ -9,43 +9,43 @@ use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 
-/// Of one change from outside so many facts are said.
+/// Maximum number of facts shown per change from outside.
 const MOST_FACTS: usize = 5;
-/// The paths of so many instances that have left the window are known, so that they do not grow with the run.
+/// Maximum number of instances that have left the window whose paths are kept, so that memory does not grow with the run.
 const MOST_GONE: usize = 1024;
 
-/// Follows events and commands, and words them for people.
+/// Follows events and commands, and formats them for people.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Progress {
-    /// Of the instances that are in the window, and of those that have left it last.
+    /// The paths of the instances in the window, and of the last ones that have left it.
     paths: BTreeMap<InstanceId, String>,
-    /// Those that have left it, the oldest first.
+    /// The instances that have left the window, oldest first.
     gone: VecDeque<InstanceId>,
     started: BTreeMap<InstanceId, Timestamp>,
-    /// What states wait for, and until when at the most.
+    /// What states wait for, and the latest end of each wait.
     awaiting: BTreeMap<InstanceId, (Awaited, Option<Timestamp>)>,
-    /// How many states have ended for good.
+    /// The number of states that have retired.
     retired: u64,
-    /// Whether no PIA is to begin.
+    /// Whether the run is paused: no PIA may begin.
     paused: bool,
-    /// What those that are under way have said last of how far they are. Lost when task control is killed.
+    /// The last progress message of each goal under way. Lost if task control is killed.
     #[serde(skip)]
     messages: BTreeMap<InstanceId, String>,
     #[serde(skip)]
     quiet: bool,
 }
 
-/// A state that is under way.
+/// A state under way.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct UnderWay {
-    /// Its path with visits.
+    /// The path of the state with visits.
     pub path: String,
-    /// Since when, in the robot's seconds.
+    /// Time since it began, in seconds of the robot's time.
     pub for_s: f64,
-    /// How long it usually takes, where its `duration` says so.
+    /// Its usual duration in seconds, if its `duration` states one.
     #[serde(default)]
     pub usually_s: Option<f64>,
-    /// What it has said last of how far it is; empty where nothing.
+    /// Its last progress message; empty if there is none.
     #[serde(default)]
     pub message: String,
 }
@@ -60,12 +60,12 @@ impl UnderWay {
 }
 
 impl Progress {
-    /// One that words what happens, or keeps silent.
+    /// Formats lines, or none if `quiet`.
     pub(crate) fn new(quiet: bool) -> Progress {
         Progress { quiet, ..Progress::default() }
     }
 
-    /// Knows of one step of a run that goes on, and says nothing of it again.
+    /// Follows one step of a run that is being resumed, without formatting it again.
     pub(crate) fn catch_up<'a>(
         &mut self,
         at: Timestamp,
@@ -90,7 +90,7 @@ impl Progress {
         self.forget(commands);
     }
 
-    /// What states begin and cease to wait for.
+    /// Records which waits of states begin and end.
     fn await_things<'a>(&mut self, commands: impl Iterator<Item = &'a Command>) {
         for command in commands {
             match command {
@@ -106,7 +106,7 @@ impl Progress {
         }
     }
 
-    /// The instances that wait by themselves, and for what.
+    /// The instances that wait for something themselves, with what they wait for.
     pub(crate) fn awaiting(&self) -> impl Iterator<Item = (InstanceId, Awaiting)> + '_ {
         self.awaiting.iter().map(|(id, (awaited, until))| {
             let until_s = until.map(Timestamp::seconds);
@@ -114,13 +114,13 @@ impl Progress {
         })
     }
 
-    /// It is not under way any more; since when it was.
+    /// Records that an instance is no longer under way; returns when it began.
     fn ends(&mut self, instance: InstanceId) -> Option<Timestamp> {
         self.messages.remove(&instance);
         self.started.remove(&instance)
     }
 
-    /// Whether PIAs may begin after an event, and how far the one is that it tells of.
+    /// Records pauses, and progress messages of goals.
     fn hear(&mut self, event: &Event) {
         match event {
             Event::Progressed { instance, message, .. } if self.started.contains_key(instance) => {
@@ -137,12 +137,12 @@ impl Progress {
         self.paused
     }
 
-    /// How many states have ended for good.
+    /// The number of states that have retired.
     pub(crate) fn retired(&self) -> u64 {
         self.retired
     }
 
-    /// The states that are under way, those that began first first; `usually_s` is how long an instance usually takes.
+    /// The states under way, in the order in which they began; `usually_s` gives the usual duration of an instance.
     pub(crate) fn under_way(&self, now: Timestamp, usually_s: impl Fn(InstanceId) -> Option<f64>) -> Vec<UnderWay> {
         let mut all: Vec<(Timestamp, InstanceId)> = self.started.iter().map(|(id, at)| (*at, *id)).collect();
         all.sort_unstable();
@@ -155,12 +155,12 @@ impl Progress {
         all.into_iter().map(one).collect()
     }
 
-    /// The paths of the instances that are known.
+    /// The paths of the known instances.
     pub(crate) fn paths(&self) -> &BTreeMap<InstanceId, String> {
         &self.paths
     }
 
-    /// Of an instance that has left the window only a failure to make it real can still be told.
+    /// Forgets instances that have left the window, except their paths: a failed commit of one may still be reported.
     fn forget<'a>(&mut self, commands: impl Iterator<Item = &'a Command>) {
         for command in commands {
             if let Command::Note(Note::Retired { instance } | Note::Squashed { instance } | Note::Merged { instance }) =
@@ -178,7 +178,7 @@ impl Progress {
         }
     }
 
-    /// What there is to say of one step, a line each.
+    /// The lines for one step.
     pub(crate) fn follow(&mut self, at: Timestamp, event: &Event, commands: &[Command]) -> Vec<String> {
         let mut lines = Vec::new();
         if self.quiet {
@@ -189,7 +189,7 @@ impl Progress {
         let waited: Vec<InstanceId> = self.awaiting.keys().copied().collect();
         self.await_things(commands.iter());
         match event {
-            // Of a result that gets better the first is told.
+            // Of several results only the first is shown.
             Event::Improved { instance, .. } => {
                 let path = self.path(*instance);
                 if let Some(began) = self.ends(*instance) {
@@ -197,7 +197,7 @@ impl Progress {
                     say(&mut lines, at, &format!("done   {path}  {took_s:.1} s, and goes on for a better one"));
                 }
             }
-            // Its result was there already.
+            // An earlier result was shown.
             Event::Finished { instance, .. } if !self.started.contains_key(instance) => {}
             Event::Finished { instance, outcome, reason, .. } => {
                 let path = self.path(*instance);
@@ -282,7 +282,7 @@ impl Progress {
                     let how = if **outcome == *SUCCESS { "waited" } else { outcome };
                     say(&mut lines, at, &format!("{how} {}  {took:.1} s", self.path(*instance)));
                 }
-                // What ended without its provider: a `requires` that does not hold, a timeout.
+                // Ended without its provider: a violated `requires`, or a timeout.
                 Command::Note(Note::Finished { instance, outcome })
                     if **outcome != *SUCCESS && !told(event, *instance) =>
                 {
@@ -322,7 +322,7 @@ impl Progress {
         lines
     }
 
-    /// What is known of an instance that waits for resources; `None` where nothing is said.
+    /// The path of an instance that waits for resources; `None` if quiet.
     pub(crate) fn waits(&self, instance: InstanceId) -> Option<String> {
         (!self.quiet).then(|| self.path(instance))
     }
@@ -332,7 +332,7 @@ impl Progress {
     }
 }
 
-/// Whether what an event says of an instance is printed already.
+/// Whether the line of an event already covers this instance.
 fn told(event: &Event, instance: InstanceId) -> bool {
     match event {
         Event::Finished { instance: of, .. } | Event::Refused { instance: of, .. } => *of == instance,

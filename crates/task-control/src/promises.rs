@@ -1,8 +1,8 @@
-//! Projections that are named before they are there: a goal leaves at once with an id that the world pool has promised, and its worker waits
-//! for the projection where it looks at it at all.
+//! Projections that are used before they exist: a goal is sent immediately with an id that the world pool has promised, and its worker waits for the
+//! projection only when it reads it.
 //!
-//! So what a node that reads the world waits for is one answer, that of its goal; its projection, and the commit before that, are made
-//! meanwhile. Goals that act are not given so: they begin when their projection is there.
+//! So a node that reads the world waits for one answer only, that of its goal; its projection, and the commit before that, are made in the meantime.
+//! Goals that act are not sent this way: they begin when their projection exists.
 
 use ratn_model::id::ProjectionId;
 use std::collections::{BTreeMap, VecDeque};
@@ -11,18 +11,18 @@ use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
 use tokio::sync::oneshot::error::TryRecvError;
 
-/// So many ids are kept.
+/// Number of promised ids to keep.
 const KEPT: usize = 32;
 
-/// So long an id is used; the world pool keeps its promises three times as long.
+/// How long a promised id is used; the world pool keeps its promises three times as long.
 const FRESH: Duration = Duration::from_secs(10);
 
-/// Where more than so many records wait for the world pool, goals wait for their projections: the workers would. A node has two, a projection and a
-/// commit. Commits that wait for the same look at the disk are a call each and no more, so a disk that takes some milliseconds once holds nobody up,
-/// and what is behind it is made long before the pool is tired of whoever waits for it (a second).
+/// If more records than this wait for the world pool, goals wait for their projections, because their workers would have to. A node has two records,
+/// a projection and a commit. Commits that wait for the same disk sync cost one call each and no more, so a sync that takes some milliseconds delays
+/// nobody, and what follows is made long before the pool's time limit for waiting calls (one second).
 const FEW_BEHIND: usize = 16;
 
-/// The ids that are promised to a run; clones share them.
+/// The ids that were promised to a run; clones share them.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Promises(Arc<Mutex<VecDeque<Promise>>>);
 
@@ -39,49 +39,49 @@ impl Promises {
         all
     }
 
-    /// An id for a projection that is to be named at once; `behind` records wait for the world pool.
+    /// Takes a promised id for a projection, if at most `FEW_BEHIND` records wait for the world pool; `behind` is their number.
     pub(super) fn take(&self, behind: usize, now: Instant) -> Option<ProjectionId> {
         if behind > FEW_BEHIND { None } else { self.fresh(now).pop_front().map(|promise| promise.id) }
     }
 
-    /// So many the next answer is to promise.
+    /// The number of ids that the next answer should promise.
     pub(super) fn wanted(&self, now: Instant) -> u32 {
         let left = self.fresh(now).len();
         if left > KEPT / 2 { 0 } else { u32::try_from(KEPT - left).unwrap_or_default() }
     }
 
-    /// What an answer has promised.
+    /// Adds the promised ids of an answer.
     pub(super) fn add(&self, promised: Vec<ProjectionId>, now: Instant) {
         let mut ids = self.fresh(now);
         ids.extend(promised.into_iter().map(|id| Promise { id, since: now }));
-        // Answers that crossed have promised more than was wanted: the pool forgets the oldest first, and so does the run.
+        // Concurrent requests may have promised more than wanted: the pool forgets the oldest first, and so does the run.
         let too_many = ids.len().saturating_sub(2 * KEPT);
         ids.drain(..too_many);
     }
 
-    /// The world pool knows of no promise: it was started again.
+    /// Forgets all promises: the world pool was restarted and does not know them.
     pub(super) fn forget(&self) {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clear();
     }
 }
 
-/// The projections that goals were given and that may not be there yet.
+/// The projections that were given to goals and may not exist yet.
 #[derive(Debug, Default)]
 pub(super) struct Making(BTreeMap<ProjectionId, oneshot::Receiver<Made>>);
 
-/// That it is there.
+/// Message: the projection exists.
 #[derive(Debug)]
 pub(super) struct Made;
 
 impl Making {
-    /// A projection is named; whoever makes it says so when it is there, and drops this where it never will be.
+    /// Registers a promised projection; its maker sends [`Made`] when it exists, and drops the sender if it never will.
     pub(super) fn begin(&mut self, projection: ProjectionId) -> oneshot::Sender<Made> {
         let (made, is_made) = oneshot::channel();
         self.0.insert(projection, is_made);
         made
     }
 
-    /// It is to be given back: at once, or when this says that it is there. An error of that: it never will be.
+    /// The projection is to be released: at once if this returns `None`, else when the receiver resolves. An error there means that it never will exist.
     pub(super) fn end(&mut self, projection: ProjectionId) -> Option<oneshot::Receiver<Made>> {
         let mut making = self.0.remove(&projection)?;
         matches!(making.try_recv(), Err(TryRecvError::Empty)).then_some(making)

@@ -1,14 +1,14 @@
-//! What workers say in words, as it is kept and shown: a terminal obeys none of it, and it has a bound.
+//! Texts from workers, made safe for terminals and limited in length, as they are kept and shown.
 
-/// So many characters of what a worker says are kept.
+/// Maximum number of characters kept of a worker's text.
 pub(super) const MAX_SAID: usize = 4096;
 
-/// As [`readable`], in one line: what is shown beside the lines of a run is none of them.
+/// Like [`readable`], in one line, so that it cannot imitate lines of a run.
 pub(super) fn one_line(said: &str) -> String {
     readable(said).split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// As [`ratn_model::readable::readable`] writes it; what is longer ends with `…`.
+/// Like [`ratn_model::readable::readable`]; longer texts are cut and end with `…`.
 pub(super) fn readable(said: &str) -> String {
     match said.char_indices().nth(MAX_SAID) {
         Some((end, _)) => format!("{}…", ratn_model::readable::readable(&said[..end])),

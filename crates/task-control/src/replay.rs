@@ -1,6 +1,5 @@
-//! A run's log, replayed through a new executive: the same events give the same commands, so it then stands where the one that
-//! was killed stood. With a checkpoint only the lines behind it are replayed. A log that says otherwise is of another program and
-//! is refused. Pure.
+//! Replays a run's log through a new executive: the same events give the same commands, so the executive is then in the state of the one that was
+//! killed. With a checkpoint only the lines after it are replayed. A log with other commands belongs to another program and is refused. Pure.
 
 use super::checkpoint::{Checkpoint, ReplayedState};
 use super::ledger::Ledger;
@@ -14,22 +13,22 @@ use ratn_model::tolerance::Tolerance;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// The version of this program, as logs name it.
+/// The version of this program, as written in logs.
 pub(super) const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// Why a run cannot be resumed from its log.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum ReplayError {
-    /// Its first line has no run id.
+    /// The first line has no run id.
     #[error("the log names no run: it was written by an earlier version; run the task again")]
     NoRun,
-    /// Another version wrote it.
+    /// It was written by another version.
     #[error("the log was written by ratn {theirs}, and this is {VERSION}: resume it with that version")]
     Version {
-        /// That version.
+        /// The version that wrote it.
         theirs: String,
     },
-    /// It is of another task.
+    /// It belongs to another task.
     #[error("the log is of the task `{theirs}`, not of `{ours}`")]
     Task {
         /// The name in the log.
@@ -37,18 +36,18 @@ pub enum ReplayError {
         /// The name in the task file.
         ours: String,
     },
-    /// The task file is not the one that the run began with.
+    /// The task file has changed since the run began.
     #[error(
         "the task file has changed since the run began: put the old one back, or run the new one from its beginning"
     )]
     Digest,
-    /// It has ended, and all that it did is recorded, or cannot be any more.
+    /// The run has ended, and everything that it did is recorded, or cannot be recorded any more.
     #[error("the run has ended with {outcome}: there is nothing to resume")]
     Ended {
         /// The outcome of the run.
         outcome: String,
     },
-    /// A command in it is not what this program gives.
+    /// The log has another command than this program gives.
     #[error(
         "line {line}: the log says {theirs}, and this program would have said {ours}: it was written by another program, for \
          another catalogue, or has been edited"
@@ -56,33 +55,33 @@ pub enum ReplayError {
     Otherwise {
         /// The number of the line, from 1.
         line: usize,
-        /// What the log says.
+        /// The command in the log.
         theirs: String,
-        /// What this program gives.
+        /// The command of this program.
         ours: String,
     },
-    /// The state in the checkpoint does not read.
+    /// The executive's state in the checkpoint cannot be restored.
     #[error("the executive's state cannot be restored: {reason}")]
     Restore {
-        /// Why.
+        /// The reason.
         reason: String,
     },
 }
 
-/// Where a run stands.
+/// The state of a run after a replay.
 pub(super) struct Replayed {
     pub(super) executive: Executive,
     pub(super) standing: ReplayedState,
-    /// Commands of the last event that are not in the log: its writer was killed among them, and has performed none of them.
-    /// They are to be performed, but those that are recorded: these are in the ledger.
+    /// Commands of the last event that are missing in the log: the process was killed before it wrote them, and has performed none of them. They have
+    /// to be performed, except those that are recorded: these are in the ledger.
     pub(super) missing: Vec<Command>,
-    /// How it has ended, where it has: what it had decided by then may not all be done.
+    /// How the run has ended, if it has: some of its decisions may not have been performed.
     pub(super) ended: Option<Ended>,
-    /// How many events were replayed.
+    /// The number of replayed events.
     pub(super) events: u64,
 }
 
-/// Whether a log that begins like this is of the program and of this version, and of a run that can be resumed.
+/// Checks by its first line that a log belongs to this program, this version, and a run that can be resumed.
 ///
 /// # Errors
 /// [`ReplayError`].
@@ -106,7 +105,7 @@ pub(super) fn check(program: &Program, first: &LogLine) -> Result<(), ReplayErro
 /// Replays a whole log.
 ///
 /// # Errors
-/// [`ReplayError`]; lines count from 1.
+/// [`ReplayError`]; line numbers start at 1.
 pub(super) fn replay(program: &Arc<Program>, lines: &[LogLine]) -> Result<Replayed, ReplayError> {
     if let Some(first) = lines.first() {
         check(program, first)?;
@@ -115,10 +114,10 @@ pub(super) fn replay(program: &Arc<Program>, lines: &[LogLine]) -> Result<Replay
     go_on(executive, ReplayedState::default(), 0, lines)
 }
 
-/// Replays the lines of a log that are behind a checkpoint of it.
+/// Replays the lines of a log after a checkpoint.
 ///
 /// # Errors
-/// [`ReplayError`]; lines count from 1, from the beginning of the log.
+/// [`ReplayError`]; line numbers start at 1, at the beginning of the log.
 pub(super) fn replay_behind(
     program: &Arc<Program>,
     checkpoint: Checkpoint,
@@ -130,7 +129,7 @@ pub(super) fn replay_behind(
     go_on(executive, standing, place.lines, lines)
 }
 
-/// Hands the events of lines to an executive and compares what it says; `before` lines are before them.
+/// Gives the events of the lines to an executive and compares its commands; there are `before` lines before these.
 fn go_on(
     mut executive: Executive,
     mut standing: ReplayedState,
@@ -143,7 +142,7 @@ fn go_on(
     while let Some(LogLine { at, entry }) = lines.get(next) {
         let event = match entry {
             LogEntry::Event(event) => event,
-            // Every command behind an event was compared with it.
+            // Every command after an event was compared with it.
             LogEntry::Command(command) => return Err(otherwise(before + next + 1, Some(command), None)),
         };
         next += 1;
@@ -172,19 +171,19 @@ fn go_on(
         logged.iter().for_each(|command| ledger.command(command));
         progress.catch_up(*at, event, missing.iter());
         missing.drain(..logged.len());
-        // Nothing of these was performed, so they are no open items. What is recorded is: all of it in order, and behind what is in the log.
+        // None of these was performed, so they are not open items. The recorded ones are added, in order, after those in the log.
         missing.iter().filter(|command| is_recorded(command)).for_each(|command| ledger.command(command));
         next += logged.len();
     }
     Ok(Replayed { executive, standing, missing, ended, events })
 }
 
-/// Whether a command is one of those that are taken up from the ledger, in order: commits, and operations.
+/// Whether a command is one of those that the ledger keeps in order: commits and operations.
 pub(super) fn is_recorded(command: &Command) -> bool {
     matches!(command, Command::Commit { .. } | Command::Operate { .. })
 }
 
-/// Keeps in mind which state an instance is of, as long as it matters.
+/// Tracks the state of each instance, as long as it is needed.
 pub(super) fn follow(states: &mut BTreeMap<InstanceId, StateId>, command: &Command) {
     match command {
         Command::Note(Note::Expanded { instance, state, .. }) => {
@@ -197,7 +196,7 @@ pub(super) fn follow(states: &mut BTreeMap<InstanceId, StateId>, command: &Comma
     }
 }
 
-/// As the log has them: what is not a number equals itself there.
+/// Compares commands as written in a log, where NaN equals itself.
 fn same(ours: &Command, theirs: &Command) -> bool {
     ours == theirs || text(Some(ours)) == text(Some(theirs))
 }
@@ -210,13 +209,13 @@ fn text(command: Option<&Command>) -> String {
     command.map_or("nothing".into(), |command| serde_json::to_string(command).unwrap_or_default())
 }
 
-/// Enough of it to see what it is.
+/// A prefix that is long enough to recognize the command.
 fn short(text: String) -> String {
     const ENOUGH: usize = 160;
     if text.chars().count() <= ENOUGH { text } else { text.chars().take(ENOUGH).chain(['…']).collect() }
 }
 
-/// Whether something of these commands must not leave before the event that led to them is safe: what cannot be undone.
+/// Whether one of these commands is irreversible, so that the event that led to it has to be on disk first.
 pub(super) fn must_be_durable(program: &Program, states: &BTreeMap<InstanceId, StateId>, commands: &[Command]) -> bool {
     use ratn_model::program::Nature;
     commands.iter().any(|command| match command {
@@ -228,7 +227,7 @@ pub(super) fn must_be_durable(program: &Program, states: &BTreeMap<InstanceId, S
     })
 }
 
-/// The time of a run that goes on: the wall's, as if task control had been there, and never behind the log.
+/// The time of a resumed run: wall time, as if task control had never been away, but not before the end of the log.
 pub(super) fn now(ledger: &Ledger, unix_ms: u64, speed: f64) -> Timestamp {
     let since = unix_ms.saturating_sub(ledger.origin.began_unix_ms);
     Timestamp::from_seconds(since as f64 / 1e3 * speed).max(ledger.last)
@@ -254,7 +253,7 @@ pub(super) mod tests {
         program(FETCH_BOXES)
     }
 
-    /// A whole run in virtual time, as task control would have logged it.
+    /// A complete run in virtual time, logged as by task control.
     pub(crate) fn log(program: &Arc<Program>, mode: Mode) -> Vec<LogLine> {
         let resources = Catalogue::standard().resources;
         let setup = Setup {
@@ -278,11 +277,11 @@ pub(super) mod tests {
         let program = fetch_boxes();
         for mode in [Mode::Hsm, Mode::Cdtn] {
             let lines = log(&program, mode);
-            // The last line is the end.
+            // The last line is the end of the run.
             for length in 1..lines.len() {
                 let Replayed { mut executive, missing, standing, .. } = replay(&program, &lines[..length]).unwrap();
                 assert_eq!(standing.ledger.last, lines[length - 1].at);
-                // What was not written is what would have been, and so is what follows.
+                // The missing commands equal the lines that were cut off, and so do later ones.
                 let mut commands = missing.into_iter();
                 for line in &lines[length..] {
                     match &line.entry {
@@ -294,7 +293,7 @@ pub(super) mod tests {
                 }
                 assert!(executive.has_ended());
             }
-            // Of one that has ended it is known what it had decided.
+            // After the end of a run, its decisions are known.
             let whole = replay(&program, &lines).unwrap();
             assert_eq!(whole.ended.map(|ended| ended.outcome).as_deref(), Some("success"));
             let decided = lines.iter().filter(|line| matches!(line.entry, LogEntry::Command(Command::Commit { .. })));
@@ -362,7 +361,7 @@ states:
         }
     }
 
-    /// A checkpoint behind so many whole events of a log, as a run that is under way makes it.
+    /// A checkpoint after these events of a log, as made by a running run.
     fn checkpoint(program: &Arc<Program>, lines: &[LogLine]) -> Checkpoint {
         let Replayed { executive, standing, missing, .. } = replay(program, lines).unwrap();
         assert_eq!(missing, []);
@@ -379,7 +378,7 @@ states:
             let mut newest = None;
             for cut in 1..lines.len() {
                 let whole = replay(&program, &lines[..cut]).unwrap();
-                // Between two events: every command of the last one is there.
+                // Only between two events, when all commands of the last one are there.
                 if matches!(lines[cut].entry, LogEntry::Event(_)) {
                     newest = Some(checkpoint(&program, &lines[..cut]).encode().unwrap());
                 }
@@ -390,7 +389,7 @@ states:
                 assert_eq!(behind.standing, whole.standing, "cut at {cut}, checkpoint at {before}");
                 assert_eq!(behind.missing, whole.missing);
                 assert!(behind.events <= 1);
-                // And it goes on alike.
+                // Both go on identically.
                 let (mut one, mut other) = (whole.executive, behind.executive);
                 for LogLine { at, entry } in &lines[cut..] {
                     if let LogEntry::Event(event) = entry {
@@ -411,7 +410,7 @@ states:
         for place in (1..cut).filter(|place| matches!(lines[*place].entry, LogEntry::Event(_))) {
             let behind = replay_behind(&program, checkpoint(&program, &lines[..place]), &lines[place..cut]).unwrap();
             assert_eq!((&behind.standing, &behind.missing), (&whole.standing, &whole.missing));
-            // The end is found, too; and a line that does not follow is refused with its number in the whole log.
+            // The end is found, too, and a wrong line is refused with its number in the whole log.
             let ended = replay_behind(&program, checkpoint(&program, &lines[..place]), &lines[place..]).unwrap().ended;
             assert_eq!(ended.map(|ended| ended.outcome).as_deref(), Some("success"));
             let refused = replay_behind(&program, checkpoint(&program, &lines[..place]), &lines[place - 1..]).err();
@@ -433,7 +432,7 @@ states:
             let ledger = replay(&program, &lines[..cut]).unwrap().standing.ledger;
             let (mut goals, mut projecting, mut waiting) = (ledger.goals, ledger.projecting, ledger.waiting);
             projecting.retain(|_, asked| asked.named.is_none());
-            // What is asked for after the cut is answered after the cut, too, and was not open.
+            // Requests after the cut are answered after the cut, too, and were not open.
             let mut asked: Vec<InstanceId> = Vec::new();
             for line in &lines[cut..] {
                 match &line.entry {
@@ -469,7 +468,7 @@ states:
         lines[at].entry = LogEntry::Command(Command::Wake { at: Timestamp(1) });
         let refused = replay(&program, &lines).err().unwrap();
         assert!(matches!(refused, ReplayError::Otherwise { line, .. } if line == at + 1), "{refused}");
-        // A command that is missing in the middle.
+        // A missing command in the middle.
         let mut lines = log(&program, Mode::Cdtn);
         lines.remove(at);
         assert!(matches!(replay(&program, &lines).err().unwrap(), ReplayError::Otherwise { .. }));

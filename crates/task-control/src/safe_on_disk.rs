@@ -1,8 +1,8 @@
-//! What was written of a run is made safe on the disk beside everything else: only what cannot be undone waits for that.
+//! Syncs the event log of a run to disk in the background: only irreversible commands wait for it.
 //!
-//! A thread makes the event log safe when it is asked to; everything that was written before one look at the disk is safe after it, so many marks
-//! that come meanwhile cost one more look. Its word goes to one task of the run, and from there to all that wait: each that the thread told itself would
-//! cost it a system call, and they would not go on together.
+//! A thread syncs the log on request; one sync covers everything written before it, so several marks that arrive in the meantime cost one more sync.
+//! The thread reports to a single task of the run, which notifies all waiting ones: if the thread notified each itself, this would cost a system call
+//! each, and they would not continue together.
 
 use ratn_worker::panic::exit_on_panic;
 use std::fs::File;
@@ -11,38 +11,38 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use tokio::sync::watch;
 
-/// Makes the log safe. Ends its thread when it is dropped.
+/// Syncs the log. Dropping it ends its thread.
 #[derive(Debug)]
 pub(super) struct Syncer {
     asks: Asks,
-    /// Through which mark it is safe. Closed when no more will be.
+    /// The last mark that is synced. Closed when no further sync will happen.
     safe: watch::Receiver<u64>,
-    /// Why no more will be.
+    /// The reason why no further sync will happen.
     failure: watch::Receiver<Option<Arc<str>>>,
     last: u64,
-    /// The last mark that the thread was asked for.
+    /// The last mark that the thread was asked to sync.
     asked: u64,
 }
 
-/// A place in the log: what cannot be undone waits until everything before it is safe.
+/// A position in the log: irreversible commands wait until everything before it is synced.
 #[derive(Debug, Clone)]
 pub(super) struct Mark {
     number: u64,
     safe: watch::Receiver<u64>,
 }
 
-/// Who is asked to make the log safe.
+/// Who syncs the log.
 #[derive(Debug)]
 enum Asks {
     /// The thread.
     Thread(Sender<u64>),
-    /// Nobody: it is on no disk, and what is written is as safe as it will be.
+    /// Nobody: the log is not on a disk, and written lines count as synced.
     Nobody(watch::Sender<u64>),
-    /// Nobody any more: it could not be written.
+    /// Nobody any more: the log could not be written.
     GivenUp,
 }
 
-/// What the thread tells.
+/// The thread's reports.
 #[derive(Debug)]
 struct Tell {
     safe: watch::Sender<u64>,
@@ -50,10 +50,10 @@ struct Tell {
 }
 
 impl Syncer {
-    /// Of a file that others write; `None`: it is on no disk. Within a tokio runtime.
+    /// Syncs a file that others write; `None` if the log is not on a disk. Must be called within a tokio runtime.
     ///
     /// # Errors
-    /// Where the thread cannot be started.
+    /// The thread cannot be started.
     pub(super) fn start(file: Option<File>) -> io::Result<Syncer> {
         match file {
             Some(file) => Syncer::of(move || file.sync_data()),
@@ -74,67 +74,67 @@ impl Syncer {
         Ok(Syncer { asks: Asks::Thread(wanted), safe, failure, last: 0, asked: 0 })
     }
 
-    /// Everything that is noted so far, which is to be made safe once it is written ([`Syncer::written`]).
+    /// Marks everything noted so far, which is synced once it is written ([`Syncer::written`]).
     pub(super) fn mark(&mut self) -> Mark {
         self.last += 1;
         self.marked()
     }
 
-    /// Everything that was marked is written: it is made safe as soon as possible.
+    /// Everything marked has been written: it is synced as soon as possible.
     pub(super) fn written(&mut self) {
         if self.asked == self.last {
             return;
         }
         self.asked = self.last;
         match &self.asks {
-            // Where the thread is gone it has said why.
+            // A thread that has ended has reported why.
             Asks::Thread(wanted) => drop(wanted.send(self.last)),
             Asks::Nobody(safe) => drop(safe.send_replace(self.last)),
             Asks::GivenUp => {}
         }
     }
 
-    /// What is noted cannot be written: it is never safe, nor is anything behind it.
+    /// Noted lines cannot be written: they and all later ones are never synced.
     pub(super) fn give_up(&mut self) {
         self.asks = Asks::GivenUp;
     }
 
-    /// Everything that was marked so far.
+    /// The mark of everything marked so far.
     pub(super) fn marked(&self) -> Mark {
         Mark { number: self.last, safe: self.safe.clone() }
     }
 
-    /// Resolves when the log cannot be made safe any more, with the reason.
+    /// Resolves with the reason when the log cannot be synced any more.
     pub(super) async fn failed(&self) -> Arc<str> {
         let mut failure = self.failure.clone();
         let looked = failure.wait_for(Option::is_some).await;
         let reason = looked.ok().and_then(|reason| reason.clone());
         match reason {
             Some(reason) => reason,
-            // There is no thread that could.
+            // There is no thread.
             None => std::future::pending().await,
         }
     }
 }
 
 impl Mark {
-    /// One that is not safe before its number, 1, is sent.
+    /// A mark that is not synced before its number, 1, is sent.
     #[cfg(test)]
     pub(super) fn not_yet() -> (watch::Sender<u64>, Mark) {
         let (told, safe) = watch::channel(0);
         (told, Mark { number: 1, safe })
     }
 
-    /// Waits until everything before it is safe; false where it never will be.
+    /// Waits until everything before it is synced; false if it never will be.
     pub(super) async fn safe(mut self) -> bool {
         let number = self.number;
-        // Where the thread is gone it has said the last that is to be said.
+        // A thread that has ended has sent its last report.
         let _ = self.safe.wait_for(|safe| *safe >= number).await;
         *self.safe.borrow() >= number
     }
 }
 
-/// Until no more is said.
+/// Forwards reports until there are no more.
 async fn pass(mut told: watch::Receiver<u64>, on: watch::Sender<u64>) {
     while told.changed().await.is_ok() {
         let through = *told.borrow_and_update();
@@ -148,7 +148,7 @@ fn work(marks: &Receiver<u64>, tell: &Tell, sync: impl Fn() -> io::Result<()>) {
         match sync() {
             Ok(()) => tell.safe.send_modify(|safe| *safe = through),
             Err(error) => {
-                // What a disk has lost once it may not tell again.
+                // After an error, a later sync may succeed although data was lost.
                 tell.failure.send_replace(Some(error.to_string().into()));
                 return;
             }

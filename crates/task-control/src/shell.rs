@@ -1,10 +1,10 @@
-//! The one loop of task control: receive an event, log it, hand it to the executive, log its commands, perform them.
+//! The loop of task control: receive an event, log it, give it to the executive, log its commands, perform them.
 //!
-//! Nothing is decided here. Whatever a command leads to comes back as an event through one bounded queue, so the event log is
-//! the whole story of the run, and a run whose task control was killed goes on from it ([`resume`]).
+//! The shell decides nothing. Every result of a command returns as an event through one bounded queue, so the event log is a complete record of the
+//! run, and a run whose task control was killed is resumed from it ([`resume`]).
 //!
-//! What is performed leaves the process when other tasks have their turn, so the events that have come by then are handled first, and the log has
-//! one write for all of them: a node that starts when another has ended has three events, two of which come of themselves.
+//! Commands leave the process when other tasks have their turn, so the events that have arrived by then are handled first, and one write to the log
+//! covers them all: a node that starts when another has ended causes three events, two of which arrive immediately.
 
 mod resume;
 
@@ -49,81 +49,81 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use tokio::runtime::{Handle, RuntimeFlavor};
 use tokio::sync::{mpsc, oneshot};
 
-/// Answers that the executive has not been given yet.
+/// Maximum number of answers that the executive has not received yet.
 pub(super) const MAX_PENDING_EVENTS: usize = 1024;
 
-/// So many events are handled before what they lead to leaves, at the most.
+/// Maximum number of events that are handled before the resulting commands leave the process.
 const MOST_AT_ONCE: u32 = 16;
 
-/// The same in this runtime: where tasks have other threads, what is performed leaves at once.
+/// The maximum for this runtime: if tasks run on several threads, commands leave immediately.
 fn most_at_once() -> u32 {
     let is_one_thread = Handle::current().runtime_flavor() == RuntimeFlavor::CurrentThread;
     if is_one_thread { MOST_AT_ONCE } else { 0 }
 }
 
-/// How often a run says what it waits for, at the most.
+/// Minimum interval between reports of what a run waits for.
 const LOOK: Duration = Duration::from_secs(5);
-/// More breakpoints than this are no help.
+/// Maximum number of breakpoints.
 const MOST_BREAKPOINTS: usize = 256;
 
-/// A task to be run once.
+/// A task to run once.
 #[derive(Debug, Clone)]
 pub struct Run {
     /// The task, loaded and checked.
     pub program: Arc<Program>,
-    /// The task file, as an absolute path; empty where there is none.
+    /// The absolute path of the task file; empty if there is none.
     pub file: String,
-    /// The state at which it begins, where the program was loaded so.
+    /// The state at which the run begins, if the program was loaded with one.
     pub from: Option<String>,
-    /// Its parameters, bound.
+    /// The bound parameters of the task.
     pub parameters: BTreeMap<String, Value>,
-    /// How it is executed.
+    /// The execution mode.
     pub mode: Mode,
-    /// What its random choices are derived from.
+    /// The seed of the run's random choices.
     pub seed: u64,
-    /// What earlier runs have taught.
+    /// Statistics from earlier runs.
     pub learned: Learned,
-    /// Where the event log goes.
+    /// The path of the event log.
     pub log: PathBuf,
-    /// Before which states the run is paused, by their paths.
+    /// The breakpoints, as paths of states.
     pub breakpoints: Vec<String>,
-    /// Whether the nodes that start and end are not told to [`Place::messages`].
+    /// Whether to omit the lines about nodes that start and end from [`Place::messages`].
     pub quiet: bool,
-    /// A checkpoint after so many events; 0 is none.
+    /// Number of events between checkpoints; 0 for no checkpoints.
     pub checkpoint_every: u64,
 }
 
-/// The system that a run is on.
+/// The system on which a run executes.
 #[derive(Debug, Clone)]
 pub struct Place {
-    /// Where its daemons are.
+    /// The endpoints of its daemons.
     pub endpoints: Endpoints,
-    /// What the run trusts and shows there.
+    /// The certificates that the run trusts and presents there.
     pub tls: ClientTls,
-    /// Where its endpoint files are.
+    /// The runtime directory, with the endpoint files.
     pub directory: PathBuf,
-    /// What there is on it.
+    /// The catalogue of the system.
     pub catalogue: Arc<Catalogue>,
-    /// Its robot: the name of a built-in one, or the absolute path of its description.
+    /// The robot: the name of a built-in one, or the absolute path of its description.
     pub robot: String,
-    /// The robot's seconds per second of wall time.
+    /// Seconds of the robot's time per second of wall time.
     pub speed: f64,
-    /// Where what people read of the run goes.
+    /// Receives messages about the run for people.
     pub messages: Messages,
-    /// Whether no other run may be under way on it beside this one.
+    /// Whether the run must be the only one on the system.
     pub alone: bool,
-    /// What comes first of what several runs need.
+    /// The priority of the run among runs that compete for resources.
     pub urgency: Urgency,
-    /// The run's share of it, and when the run is due.
+    /// The run's share (weight) of these resources, and when the run is due.
     pub standing: Standing,
 }
 
-/// How urgent a run is beside others. What is needed for certain comes before what is speculative, however urgent that is.
+/// The urgency of a run beside others. Certain needs come before speculative ones, however urgent these are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub enum Urgency {
-    /// It has what others leave.
+    /// It gets what others leave.
     Low,
-    /// As most are.
+    /// The usual urgency.
     #[default]
     Normal,
     /// Others wait for it.
@@ -135,19 +135,18 @@ pub enum Urgency {
 pub struct Ended {
     /// The outcome of the task.
     pub outcome: String,
-    /// What the task gave.
+    /// The outputs of the task.
     pub outputs: BTreeMap<String, Value>,
-    /// Why it ended so; empty for a success.
+    /// The reason for the outcome; empty for a success.
     pub reason: String,
-    /// The robot's seconds from the first event to the last.
+    /// Time from the first event to the last, in seconds of the robot's time.
     pub makespan_s: f64,
 }
 
 /// Runs a task on a running system.
 ///
 /// # Errors
-/// When the system cannot be reached, the log cannot be written, or the user insists. A task that ends badly is no error: its
-/// outcome says so.
+/// The system cannot be reached, the log cannot be written, or the user insists on ending. A task that fails is no error: its outcome says so.
 pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
     let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
     let id = fresh_id("run");
@@ -217,10 +216,10 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
     shell.run_to_its_end(begin, interrupt).await
 }
 
-/// Breakpoints of a program, by the paths of states with or without visits.
+/// Checks breakpoints of a program, given by the paths of states with or without visits.
 ///
 /// # Errors
-/// Where there is no such state, where a run would never stop for it, and where they are too many.
+/// There is no such state, a run would never stop at it, or there are too many breakpoints.
 pub fn breakpoints(program: &Program, states: &[String]) -> Result<Vec<String>, String> {
     if states.len() > MOST_BREAKPOINTS {
         return Err(format!("a run has at most {MOST_BREAKPOINTS} breakpoints: take one away first"));
@@ -240,7 +239,7 @@ pub fn breakpoints(program: &Program, states: &[String]) -> Result<Vec<String>, 
     states.iter().map(breakpoint).collect()
 }
 
-/// A share that is not the usual one is kept, so that the run has it when it is resumed, too.
+/// An unusual share is logged, so that a resumed run keeps it.
 fn share_told(standing: Standing) -> Option<f64> {
     (standing.share != Standing::default().share).then_some(standing.share)
 }
@@ -249,72 +248,72 @@ fn syncer_of(log: &LogWriter) -> anyhow::Result<Syncer> {
     Syncer::start(log.handle()?).context("cannot make the event log safe")
 }
 
-/// A disk that takes longer at the end of a run is said to be waited for.
+/// If the disk takes longer at the end of a run, the user is told.
 const SLOW_DISK: Duration = Duration::from_secs(2);
 
 /// A run under way.
 struct Shell {
     program: Arc<Program>,
     executive: Executive,
-    /// Which states the instances are of.
+    /// The state of each instance.
     states: BTreeMap<InstanceId, StateId>,
     mode: Mode,
-    /// When the executive wants to be woken.
+    /// The times at which the executive wants to be woken.
     timers: BTreeSet<Timestamp>,
     log: LogWriter,
     syncer: Syncer,
-    /// None where there shall be no checkpoints, or can be none.
+    /// `None` if checkpoints are disabled or impossible.
     checkpointer: Option<Checkpointer>,
     progress: Progress,
     messages: Messages,
-    /// What is said when the log is written.
+    /// Lines that are shown when the log has been written.
     lines: String,
-    /// How many events were handled since.
+    /// Number of events handled since the log was last written.
     at_once: u32,
     clock: RobotClock,
     control: Option<Control>,
-    /// None in HSM mode, which has one order only.
+    /// `None` in HSM mode, which has only one order.
     advisor: Option<Advisor>,
-    /// Whether enough has changed since the advisor was asked.
+    /// Tracks whether enough has changed since the advisor was last asked.
     lookout: Lookout,
-    /// When it may be asked again.
+    /// When the advisor may be asked again.
     ask_at: Option<Instant>,
-    /// When what waits is looked at again.
+    /// When waiting instances are reported again.
     look_at: Instant,
-    /// When the first of the timers is due, by the wall clock.
+    /// The first timer, and its time on the wall clock.
     wake_at: Option<(Timestamp, Instant)>,
-    /// Rings when the next of these is due.
+    /// Fires at the next of these times.
     alarm: Alarm,
-    /// Who is to be told that what was sent is in the log, and what becomes of it.
+    /// Clients to notify when their message is in the log, each with the answer.
     confirm: Vec<(oneshot::Sender<Result<String, String>>, String)>,
     performer: Performer,
     answers: mpsc::Receiver<performer::Answer>,
-    /// Where the process sends its spans.
+    /// The spans of the run, if its process sends them.
     spans: Option<Spans>,
 }
 
 impl Shell {
-    /// Begins and goes on until the run has ended; then everything is recorded and given back, whatever happened.
+    /// Runs from `begin` until the run has ended; then everything is recorded and released in any case.
     async fn run_to_its_end(
         mut self,
         begin: impl AsyncFnOnce(&mut Shell) -> anyhow::Result<Option<Ended>>,
         interrupt: &Interrupt,
     ) -> anyhow::Result<Ended> {
         let ended = self.until_ended(begin, interrupt).await;
-        // Also what a failure came of.
+        // The log also needs the event that led to a failure.
         let handed_over = self.hand_over();
         let ended = ended.and_then(|ended| handed_over.map(|()| ended));
         let spans = self.spans.take();
         self.performer.begin_no_more();
         self.all_is_safe().await;
-        // What is granted to one that was withdrawn goes back, also if that is heard only now.
+        // Grants to withdrawn requests are released, even if they are received only now.
         self.answers.close();
         while let Ok(answer) = self.answers.try_recv() {
             self.performer.accept(answer, self.executive.root());
         }
         let (done, closed) = self.performer.close().await;
         if ended.is_ok() {
-            // Whoever resumes the run knows what is left to do of it.
+            // A resumption then knows what is left to do.
             let now = self.clock.now();
             if let Err(error) = done.iter().try_for_each(|event| self.log.append(now, event, &[])) {
                 tracing::warn!("the event log does not say what was recorded at the end: {error:#}");
@@ -322,14 +321,14 @@ impl Shell {
         }
         Spans::end(spans).await;
         match (ended, closed) {
-            // A success of which not everything is known afterwards is none.
+            // A success that is not completely recorded is an error.
             (Ok(ended), Err(error)) if ended.outcome == SUCCESS => Err(error),
-            // The reason is in the outcome already, or matters less.
+            // The error is part of the outcome already, or matters less.
             (ended, _) => ended,
         }
     }
 
-    /// Waits until the event log is safe on its disk, or never will be: what the run has decided is not given up because that is slow.
+    /// Waits until the event log is synced to disk, or never will be: decisions of the run are not given up because the disk is slow.
     async fn all_is_safe(&mut self) {
         let mark = self.syncer.mark();
         self.syncer.written();
@@ -358,7 +357,7 @@ impl Shell {
         }
     }
 
-    /// Hands an event to the executive, and what it commands to whoever does it.
+    /// Gives an event to the executive, and its commands to the performer.
     fn step(&mut self, event: Event) -> anyhow::Result<Option<Ended>> {
         let (now, commands) = self.decide(&event)?;
         let safe = replay::must_be_durable(&self.program, &self.states, &commands).then(|| self.syncer.mark());
@@ -366,7 +365,7 @@ impl Shell {
         self.perform(now, commands, safe)
     }
 
-    /// What the executive makes of an event, written down.
+    /// Gives an event to the executive, and logs it with the commands.
     fn decide(&mut self, event: &Event) -> anyhow::Result<(Timestamp, Vec<Command>)> {
         let now = self.clock.now();
         if *event == Event::Woken {
@@ -375,7 +374,7 @@ impl Shell {
         Ok((now, self.decide_at(now, event)?))
     }
 
-    /// The same at a moment, from which on nothing has happened yet.
+    /// The same at a given time, when nothing later has happened yet.
     fn decide_at(&mut self, now: Timestamp, event: &Event) -> anyhow::Result<Vec<Command>> {
         let commands = self.executive.handle(now, event.clone());
         commands.iter().for_each(|command| replay::follow(&mut self.states, command));
@@ -385,7 +384,7 @@ impl Shell {
             tokio::spawn(async move {
                 let unsafe_on_disk =
                     || "the event log cannot be made safe on its disk: it is not known whether this counts".to_owned();
-                // Whoever sent it may have gone.
+                // The receiver may have been dropped.
                 let _ = say.send(if safe.safe().await { Ok(said) } else { Err(unsafe_on_disk()) });
             });
         }
@@ -405,7 +404,7 @@ impl Shell {
         Ok(commands)
     }
 
-    /// Of what is said together each line but the last ends with a line break.
+    /// Adds a line; lines shown together are separated by line breaks.
     fn say(&mut self, line: &str) {
         if !self.lines.is_empty() {
             self.lines.push('\n');
@@ -413,11 +412,10 @@ impl Shell {
         self.lines.push_str(line);
     }
 
-    /// Hands what is noted to the operating system, before anything that it led to leaves the process, and has it made safe where something waits
-    /// for that.
+    /// Writes the noted lines to the log file, before any of their effects leaves the process, and requests a sync if something waits for it.
     fn hand_over(&mut self) -> anyhow::Result<()> {
         self.at_once = 0;
-        // Nothing may then be done that waits for what was noted.
+        // After a failed write, nothing that waits for a sync may be done.
         self.log.write().inspect_err(|_| self.syncer.give_up())?;
         self.syncer.written();
         if !self.lines.is_empty() {
@@ -427,7 +425,7 @@ impl Shell {
         Ok(())
     }
 
-    /// What cannot be undone is done when what led to it is safe on the disk, and so is what others may then do; all else at once.
+    /// Performs commands: irreversible ones, and those that enable others to act, after the log is synced; all others at once.
     fn perform(
         &mut self,
         now: Timestamp,
@@ -451,7 +449,7 @@ impl Shell {
         Ok(None)
     }
 
-    /// What is still to be done may be done in a better order, while something runs.
+    /// Asks for a better dispatch order of the remaining work, while something runs.
     fn ask_for_advice(&mut self) {
         self.ask_at = None;
         let outlook = self.executive.outlook(self.clock.now());
@@ -463,14 +461,14 @@ impl Shell {
         }
     }
 
-    /// How long a state usually takes, in the robot's seconds, where its file says it in a number.
+    /// The usual duration of a state in seconds of the robot's time, if its file states a number.
     fn usually_s(&self, instance: InstanceId) -> Option<f64> {
         let state = self.program.state(*self.states.get(&instance)?);
         let seconds = state.annotations.duration_s.as_ref()?.evaluate(&NothingKnown).ok()?.as_number()?;
         (seconds.is_finite() && seconds > 0.0).then_some(seconds)
     }
 
-    /// What the run is doing, for whoever asks.
+    /// The status of the run.
     fn status(&self) -> RunStatus {
         let (now, standing) = (self.clock.now(), self.performer.standing());
         RunStatus {
@@ -490,10 +488,10 @@ impl Shell {
         }
     }
 
-    /// The event that a message is, and what becomes of it.
+    /// The event for a message, and the answer to its sender.
     ///
     /// # Errors
-    /// Why it is none for this run as it stands.
+    /// The message is not acceptable for this run in its present state.
     fn event_of(&self, message: Message) -> Result<(Event, String), String> {
         let run = message.run();
         let (id, task) = (self.performer.run(), self.program.name.as_str());
@@ -531,7 +529,7 @@ impl Shell {
         Ok((Event::Signalled { signal, value }, said))
     }
 
-    /// A breakpoint is set, or one is taken away, or all are.
+    /// Sets a breakpoint, or removes one or all.
     fn breakpoints(&self, state: Option<&str>, set: bool) -> Result<(Event, String), String> {
         let mut states = self.executive.breakpoints().to_vec();
         match state.map(without_visits) {
@@ -585,7 +583,7 @@ impl Shell {
         Ok((Event::Answered { instance: *instance, choice }, said))
     }
 
-    /// Whoever resumes this run begins here. Between two events all that was logged has been performed.
+    /// Makes a checkpoint, from which the run can be resumed. Between two events, all logged commands have been performed.
     fn make_checkpoint(&mut self) {
         if let Some(checkpointer) = &mut self.checkpointer {
             let confirmed = self.performer.confirmed();
@@ -593,7 +591,7 @@ impl Shell {
         }
     }
 
-    /// What is to be done next without an answer that leads to it, and when.
+    /// The next timed work, and its time.
     fn next_due(&mut self) -> (Due, Instant) {
         let timer = self.timers.first().copied();
         if self.wake_at.map(|(of, _)| of) != timer {
@@ -611,7 +609,7 @@ impl Shell {
         others.into_iter().flatten().chain([look]).min_by_key(|(_, at)| *at).unwrap_or(look)
     }
 
-    /// The next event that the executive has to know of.
+    /// The next event for the executive.
     async fn next(&mut self, interrupt: &Interrupt, asked: &mut EndRequests) -> anyhow::Result<Event> {
         loop {
             if self.at_once < most_at_once()
@@ -666,11 +664,11 @@ impl Shell {
                 asked = told => match asked {
                     Asked::Told(event) => return Ok(*event),
                     Asked::Status(say) => {
-                        // Whoever asked may have gone.
+                        // The receiver may have been dropped.
                         let _ = say.send(self.status());
                         continue;
                     }
-                    // Who sent it was told that it is not known whether it came.
+                    // Its sender was told that the result is unknown.
                     Asked::Message(_, say) if say.is_closed() => continue,
                     Asked::Message(message, say) => match self.event_of(message) {
                         Ok((event, said)) => {
@@ -687,7 +685,7 @@ impl Shell {
                 reason = self.syncer.failed() => {
                     bail!("{} cannot be made safe on its disk: {reason}", self.log.path().display())
                 }
-                // Asked once it does what is to be done on the way out, asked twice it ends at once.
+                // The first request ends the run in order (clean-up included), the second at once.
                 () = interrupt.asked_times(asked.by_the_user + 1), if asked.by_the_user < 2 => {
                     asked.by_the_user += 1;
                     return Ok(Event::AbortRequested { reason: "the user asked for it".into(), at_once: false });
@@ -705,29 +703,29 @@ impl Shell {
     }
 }
 
-/// What a run does at a moment.
+/// Timed work of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Due {
     /// The executive is woken.
     Timer,
-    /// The advisor is asked.
+    /// The advisor is asked for advice.
     Advice,
     /// A checkpoint is made.
     Checkpoint,
-    /// What waits is looked at.
+    /// Waiting instances are reported.
     Look,
 }
 
-/// What has asked the run to end.
+/// The requests to end the run so far.
 #[derive(Debug, Default)]
 struct EndRequests {
-    /// So often.
+    /// Number of requests by the user.
     by_the_user: u32,
     for_lost_leases: bool,
 }
 
 impl Ended {
-    /// By the command that ended it, at this moment; nothing by another one.
+    /// The end of the run, if this command ends it.
     pub(crate) fn of(command: Command, now: Timestamp) -> Option<Ended> {
         match command {
             Command::End { outcome, outputs, reason } => {
@@ -738,7 +736,7 @@ impl Ended {
     }
 }
 
-/// Whoever looks for a better order, where there is more than one. A run goes on without.
+/// Starts the advisor if there are several orders to choose from. A run can do without it.
 fn advisor_of(mode: Mode, seed: u64) -> Option<Advisor> {
     match mode {
         Mode::Hsm => None,
@@ -746,7 +744,7 @@ fn advisor_of(mode: Mode, seed: u64) -> Option<Advisor> {
     }
 }
 
-/// What the states of a program are, by path, and which kinds of resources move the robot.
+/// The natures of a program's states, by path, and the kinds of resources that move the robot.
 fn natures(program: &Program, catalogue: &Catalogue) -> Natures {
     let is_action = |state: &&State| matches!(state.kind, StateKind::Action { .. });
     let actions = |is_meant: fn(&Nature) -> bool| {
@@ -768,7 +766,7 @@ pub(crate) fn changes_at_exit(program: &Program) -> Vec<String> {
     changing.map(|state| state.path.clone()).collect()
 }
 
-/// Where the program lets younger PIAs run beside one that might still fail.
+/// The PIAs with imprecise exceptions: younger PIAs may run beside them although they may still fail.
 fn imprecise(program: &Program) -> Vec<String> {
     let is_pia = |state: &&State| {
         matches!(state.kind, StateKind::Action { .. }) && state.annotations.nature == Nature::Irreversible

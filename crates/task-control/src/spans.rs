@@ -1,11 +1,11 @@
-//! The spans that a run sends while it goes on, where its process has a sender ([`ratn_otlp::start`]).
+//! The spans that a run sends while it is under way, if its process has a sender ([`ratn_otlp::start`]).
 //!
 //! ```text
 //!   begins ─────────────────────────────────────────▶ Following ──▶ end: what is left, and the run's own span
 //!   goes on ──▶ CatchingUp: a thread reads the log; ──▶ Following
 //!               what happens meanwhile is kept
 //! ```
-//! A run that goes on does not wait for its log to be read: a checkpoint has spared it that.
+//! A resumed run does not wait until its log has been read: its checkpoint made that unnecessary.
 
 use super::messages::Messages;
 use ratn_event_log::{Lines, LogError};
@@ -19,21 +19,21 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use tokio::sync::oneshot::{self, error::TryRecvError};
 use tokio::time::Instant;
 
-/// While the log is read so many events are kept. Of a run in which more happen meanwhile no more spans are sent.
+/// Maximum number of events that are kept while the log is read. If more happen, the run sends no further spans.
 const MOST_KEPT: usize = 16_384;
-/// What a process that was killed has recorded in its last moments may not have left its queue: it is sent again. A collector that has
-/// taken it sees the same ids twice.
+/// Spans that a killed process recorded in its last moments may not have been sent: they are sent again. A collector that has received them gets the
+/// same ids twice.
 const SENT_AGAIN: Duration = Duration::from_secs(3);
 
-/// The thread that reads it has ended without a word.
+/// The reading thread has ended without a result.
 const UNREAD: &str = "its log is not read";
 
-/// A run's place in its trace, of which the export of its log is, too.
+/// The trace context of a run, which is the same in an export of its log.
 pub(super) fn trace_of(run: &str, task: &str, seed: u64, began_unix_ms: u64) -> TraceContext {
     TraceContext::of(ids::trace(run, task, seed, began_unix_ms), ids::ROOT)
 }
 
-/// The spans of a run under way.
+/// The spans of a run.
 #[derive(Debug)]
 pub(super) struct Spans {
     sender: &'static Sender,
@@ -48,14 +48,14 @@ enum Stage {
         kept: Vec<Step>,
         messages: Messages,
     },
-    /// It cannot be known what was before.
+    /// The earlier part of the run is unknown.
     GivenUp,
 }
 
-/// An event that the executive was given, and what it commanded.
+/// An event of the executive, and the commands that it gave.
 type Step = (Timestamp, Event, Vec<Command>);
 
-/// What a log comes to.
+/// The result of reading a log.
 #[derive(Debug)]
 struct CaughtUp {
     live: Box<Live>,
@@ -63,25 +63,25 @@ struct CaughtUp {
     again: Vec<Span>,
 }
 
-/// The log of a run that goes on, up to where it does.
+/// The log of a resumed run, up to the resumption.
 #[derive(Debug)]
 pub(super) struct Before {
-    /// Where it is.
+    /// Path of the log.
     pub(super) log: PathBuf,
-    /// So many bytes of it are before.
+    /// Length of the log before the resumption, in bytes.
     pub(super) bytes: u64,
-    /// When the last event of it was.
+    /// The time of the last event in it.
     pub(super) last: Timestamp,
 }
 
 impl Spans {
-    /// Of a run whose clock begins now; `None` where nobody wants them.
+    /// For a run that begins now; `None` if the process has no sender.
     pub(super) fn of_a_run_that_begins(speed: f64) -> Option<Spans> {
         let sender = ratn_otlp::sender()?;
         Some(Spans { sender, stage: Stage::Following(Box::new(Live::new(unix_ns(), speed))) })
     }
 
-    /// Of a run that goes on, whose clock says this now.
+    /// For a resumed run, whose clock shows `now`.
     pub(super) fn of_a_run_that_goes_on(
         before: Before,
         now: Timestamp,
@@ -93,10 +93,10 @@ impl Spans {
         let live = Box::new(Live::new(unix_ns().saturating_sub(since_ns), speed));
         let (told, read) = oneshot::channel();
         let reading = move || {
-            // Whoever waits for it may have ended.
+            // The receiver may have been dropped.
             let _ = told.send(caught_up(live, &before, speed));
         };
-        // Without the thread nobody tells, and the spans are given up.
+        // If the thread cannot be started, the sender is dropped, and the spans are given up.
         let _ = std::thread::Builder::new().name("spans".to_owned()).spawn(reading);
         Some(Spans { sender, stage: Stage::CatchingUp { read, kept: Vec::new(), messages: messages.clone() } })
     }
@@ -117,7 +117,7 @@ impl Spans {
         }
     }
 
-    /// Sends what is left, and the run's own span; waits for that no longer than [`END_OF_RUN`].
+    /// Sends the remaining spans, and the run's own span; waits at most [`END_OF_RUN`].
     pub(super) async fn end(spans: Option<Spans>) {
         let Some(mut spans) = spans else { return };
         let (sender, until) = (spans.sender, Instant::now() + END_OF_RUN);
@@ -156,7 +156,7 @@ impl Spans {
     }
 }
 
-/// Reads what was before.
+/// Reads the log up to the resumption.
 fn caught_up(mut live: Box<Live>, before: &Before, speed: f64) -> Result<CaughtUp, LogError> {
     let from_s = before.last.seconds() - SENT_AGAIN.as_secs_f64() * speed;
     let mut again = Vec::new();

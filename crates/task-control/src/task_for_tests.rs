@@ -5,7 +5,7 @@ use ratn_model::program::Program;
 
 pub(crate) const FETCH_BOXES: &str = include_str!("../../../examples/fetch_boxes.yaml");
 
-/// The task of this text, which must be good.
+/// Loads a task, which must be valid.
 pub(crate) fn program(text: &str) -> Program {
     match ratn_model::load::load(text, "fetch_boxes.yaml", &Catalogue::standard()) {
         Ok(loaded) => loaded.program,

@@ -12,23 +12,23 @@ use std::time::Duration;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ResourceManagerConfig {
-    /// Where to listen; `local` is a Unix socket in the runtime directory.
+    /// The address to listen at; `local` is a Unix socket in the runtime directory.
     pub listen: Endpoint,
-    /// A session may ask for at most so long without a keep-alive, in milliseconds; more is shortened to this.
+    /// Maximum time to live of a session without a keep-alive, in milliseconds; longer requests are shortened to this.
     pub max_session_ttl_ms: u64,
-    /// An acquire may wait for at most so long, in milliseconds; more is shortened to this.
+    /// Maximum waiting time of an acquire, in milliseconds; longer requests are shortened to this.
     pub max_wait_ms: u64,
-    /// Clients that watch at the same time.
+    /// Maximum number of clients that watch at the same time.
     pub max_watchers: usize,
-    /// A provider that is asked for more of a kind has so long for each, in milliseconds; then another one is asked.
+    /// How long a provider may take for each resource that it is asked for, in milliseconds; then another provider is asked.
     pub provider_patience_ms: u64,
-    /// A request that has waited for what others hold for so long, in milliseconds, is one for which providers start more of it.
+    /// After waiting this long for held resources, in milliseconds, a request makes providers start more of them.
     pub grow_after_ms: u64,
-    /// The direct superclasses of kinds, `VacuumGripper = ["Gripper"]`: who asks for a kind may get one of a kind below it.
+    /// The direct superclasses of kinds, `VacuumGripper = ["Gripper"]`: a request for a kind may get a subclass.
     pub kinds: BTreeMap<String, Vec<String>>,
-    /// Bounds of everything that a client can make grow.
+    /// Limits for everything that clients can make grow.
     pub limits: Limits,
-    /// What is kept over a restart.
+    /// What is stored across restarts.
     pub storage: StorageConfig,
 }
 
@@ -49,7 +49,7 @@ impl Default for ResourceManagerConfig {
 }
 
 impl ResourceManagerConfig {
-    /// None where they are not as [`Check::check`] wants them.
+    /// The hierarchy of kinds; empty if they violate [`Check::check`].
     pub(crate) fn hierarchy(&self) -> Kinds {
         Kinds::new(&self.kinds).unwrap_or_default()
     }

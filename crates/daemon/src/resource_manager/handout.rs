@@ -2,13 +2,12 @@
 //!
 //! ```text
 //!   asked of the first that has room ──▶ there in time ──▶ met
-//!        ▲                                    │ no progress for too long, says that it has no room, or is gone
+//!        ▲                                    │ no progress for too long, reports no room, or is gone
 //!        └───────────── the next one ◀────────┘
 //! ```
-//! First in the order are those that do what they are asked: who failed goes behind who did not, and who never provided anything counts as
-//! having failed once. What is asked of one stays its for as long as it has room for it. What is beyond all room is told to everybody who could ever meet
-//! it, so that who waits hears why there is no more. A pure state machine: what is asked of whom depends on nothing but what was said
-//! so far, and is the same as long as that is.
+//! Reliable providers come first: those that failed go behind those that did not, and a provider that has never provided anything counts as having
+//! failed once. A provider stays responsible for what it was asked as long as it has room for it. Demand beyond all room is told to every provider
+//! that could ever meet it, so that the waiters are told why there is no more. A pure state machine: the result depends only on the reports so far.
 
 use ratn_model::time::Timestamp;
 use ratn_resources::SessionId;
@@ -16,23 +15,23 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// What is missing.
+/// A demand.
 #[derive(Debug, Clone)]
 pub(super) struct Missing {
-    /// The same for the same selector.
+    /// Equal for equal selectors.
     pub(super) selector: Arc<str>,
-    /// How much.
+    /// The missing amount.
     pub(super) count: u32,
-    /// What each provider can do about it.
+    /// What each provider can contribute.
     pub(super) of: Vec<Part>,
 }
 
-/// What one provider can do about what is missing.
+/// What one provider can contribute to a demand.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Part {
-    /// How much of it it provides already.
+    /// How much of it the provider provides already.
     pub(super) provided: u32,
-    /// How much it can provide beside that now; nothing where it never can.
+    /// How much more it can provide now; `None` if it never can.
     pub(super) room: Option<u32>,
 }
 
@@ -41,17 +40,17 @@ pub(super) struct Part {
 pub(super) struct HandOut {
     patience: Duration,
     turns: BTreeMap<(Arc<str>, SessionId), Turn>,
-    /// As they are after the round that is under way.
+    /// The turns after the present round.
     next: BTreeMap<(Arc<str>, SessionId), Turn>,
     track_records: BTreeMap<SessionId, TrackRecord>,
 }
 
-/// How a provider did, whatever it was asked for.
+/// How well a provider has done, whatever it was asked for.
 #[derive(Debug, Clone, Copy, Default)]
 struct TrackRecord {
-    /// It has provided something that was missing.
+    /// Whether it has provided anything that was missing.
     proven: bool,
-    /// How often it came no closer in its time, since it did last.
+    /// How often it ran out of time without progress, since its last progress.
     failed: u32,
 }
 
@@ -61,32 +60,32 @@ impl TrackRecord {
     }
 }
 
-/// What was asked of a provider.
+/// A request to a provider.
 #[derive(Debug, Clone, Copy)]
 struct Turn {
-    /// How much; 0 where it is the turn of others.
+    /// The amount; 0 while it is the turn of other providers.
     asked: u32,
-    /// What it provided when there was progress last.
+    /// The amount provided at the last progress.
     provided: u32,
     since: Timestamp,
-    /// How often it was passed on to others.
+    /// How often the request was passed on to other providers.
     passed: u32,
 }
 
 impl HandOut {
-    /// A provider has so long to come closer to what is asked of it.
+    /// A provider has `patience` to make progress with what it is asked.
     pub(super) fn new(patience: Duration) -> HandOut {
         HandOut { patience, turns: BTreeMap::new(), next: BTreeMap::new(), track_records: BTreeMap::new() }
     }
 
-    /// A round begins, in which all that is missing is handed out to these.
+    /// Begins a round, in which all demands are handed out to these providers.
     pub(super) fn begin(&mut self, providers: &[SessionId]) {
         let providers: BTreeSet<&SessionId> = providers.iter().collect();
         self.track_records.retain(|session, _| providers.contains(session));
         self.next.clear();
     }
 
-    /// How much of a demand is asked of each of the round's providers now.
+    /// The amount of a demand that each provider of the round is asked for now.
     pub(super) fn hand_out(&mut self, now: Timestamp, providers: &[SessionId], demand: &Missing) -> Vec<u32> {
         let mut asked = vec![0; providers.len()];
         let able = |(index, part): (usize, &Part)| {
@@ -121,12 +120,12 @@ impl HandOut {
         asked
     }
 
-    /// The round is over: what was not handed out in it is not missing any more.
+    /// Ends the round: demands that were not handed out in it are no longer missing.
     pub(super) fn end(&mut self) {
         self.turns = std::mem::take(&mut self.next);
     }
 
-    /// As it is after what has passed since.
+    /// The turn after the time that has passed.
     fn turn(&mut self, now: Timestamp, selector: &Arc<str>, session: &SessionId, provided: u32) -> Turn {
         let key = (Arc::clone(selector), session.clone());
         let standing = self.track_records.entry(session.clone()).or_default();
@@ -145,7 +144,7 @@ impl HandOut {
         }
     }
 
-    /// When somebody's time is over: what was handed out is to be handed out again then.
+    /// When a provider's time is over: then the demands have to be handed out again.
     pub(super) fn deadline(&self) -> Option<Timestamp> {
         self.turns.values().filter(|turn| turn.asked > 0).map(|turn| turn.since + self.patience).min()
     }
@@ -170,7 +169,7 @@ mod tests {
         Timestamp::from_seconds(seconds)
     }
 
-    /// What is asked in a round, by provider and demand.
+    /// The requests of a round, by provider and demand.
     fn round(hand_out: &mut HandOut, now: Timestamp, providers: &[SessionId], missing: &[Missing]) -> Vec<Vec<u32>> {
         hand_out.begin(providers);
         let asked: Vec<_> = missing.iter().map(|demand| hand_out.hand_out(now, providers, demand)).collect();
@@ -178,13 +177,13 @@ mod tests {
         (0..providers.len()).map(|index| asked.iter().map(|of| of[index]).collect()).collect()
     }
 
-    /// What is asked of each of two providers that have room for so many more.
+    /// The requests to two providers with this room.
     fn asked_with_room(hand_out: &mut HandOut, seconds: f64, count: u32, of: [(u32, Option<u32>); 2]) -> [u32; 2] {
         let asked = round(hand_out, at(seconds), &sessions(&["a", "b"]), &missing(count, &of));
         [asked[0][0], asked[1][0]]
     }
 
-    /// The same of providers of at most 3 workers.
+    /// The requests to two providers of at most 3 workers each.
     fn asked(hand_out: &mut HandOut, seconds: f64, count: u32, provided: [u32; 2]) -> [u32; 2] {
         asked_with_room(hand_out, seconds, count, provided.map(|provided| (provided, Some(3 - provided))))
     }
@@ -246,7 +245,7 @@ mod tests {
         assert_eq!(asked(&mut hand_out, 44.0, 1, [1, 0]), [1, 0], "in turn");
     }
 
-    /// Three that say they provide a kind and never do, and the real one behind them.
+    /// Three providers that never provide the kind they offer, and the real one after them.
     #[test]
     fn who_fails_goes_to_the_end_and_who_never_provided_anything_comes_last() {
         let mut hand_out = HandOut::new(PATIENCE);
@@ -260,11 +259,11 @@ mod tests {
         for (seconds, asked) in [(0.0, "liar-1"), (15.0, "liar-2"), (30.0, "liar-3"), (45.0, "real")] {
             assert_eq!(first(seconds, &names, 0), asked);
         }
-        // It has provided: it is asked first from now on, also when new ones say that they provide as much.
+        // It has provided: from now on it is asked first, also when new ones claim to provide as much.
         assert_eq!(first(50.0, &names, 1), "real");
         let more = ["liar-4", "liar-1", "liar-2", "liar-3", "real"];
         assert_eq!(first(51.0, &more, 1), "real");
-        // It fails once: who never provided anything is asked in its place, once each.
+        // It fails once: those that have never provided anything are asked instead, once each.
         assert_eq!(first(66.0, &more, 1), "liar-4");
         assert_eq!(first(81.0, &more, 1), "real");
     }

@@ -1,4 +1,4 @@
-//! The pool in its journal: what it was from a snapshot and the entries after it.
+//! Stores the pool in its journal, and restores it from a snapshot and the entries after it.
 
 use super::ROLE;
 use crate::config::{Durability, StorageConfig};
@@ -9,7 +9,7 @@ use ratn_resources::{DecodeError, Limits, Pool, Record, RestoreError, Snapshot, 
 use ratn_storage::{MakeSnapshot, Position, Recovered, Store};
 use std::sync::Arc;
 
-/// Why a log is none of a pool.
+/// Why a log does not contain a valid pool.
 #[derive(Debug, thiserror::Error)]
 enum NoPool {
     #[error("the snapshot means nothing")]
@@ -32,8 +32,7 @@ impl Journaled for Pool {
     }
 }
 
-/// Takes the place of the one writer, and restores the pool. Without durability, and where an older state was put in place, somebody may
-/// have heard of revisions that are lost.
+/// Becomes the only writer, and restores the pool. Without durability, or if a backup was restored, clients may have received revisions that are lost.
 pub(super) fn open(
     config: &StorageConfig,
     store: Arc<dyn Store>,
@@ -42,17 +41,17 @@ pub(super) fn open(
     let (pool, journal) = Journal::open(ROLE, config, store, |recovered| restore(recovered, limits))?;
     let may_have_lost = config.durability == Durability::None && pool.revision() > Revision(0);
     let floor = if may_have_lost || journal.is_restored() { floor() } else { 0 };
-    // A predecessor that was got past may have promised more than it wrote down.
+    // A previous process that was superseded may have promised more than it recorded.
     Ok((pool.with_revisions_above(Revision(floor)).with_session_grace(CONFIRMED_FOR), journal))
 }
 
-/// The pool as the log has it.
+/// Reads the pool from the log.
 pub(super) fn read(journal: &Journal, limits: Limits) -> Result<Pool, JournalError> {
     journal.read(|recovered| restore(recovered, limits))
 }
 
-/// The pool of a snapshot and the entries after it. Its tokens are above all of before, also where the end of the log was lost (no
-/// durability, a restored backup): those of one start begin at its time.
+/// The pool of a snapshot and the entries after it. Its tokens are above all earlier ones even if the end of the log was lost (no durability, a
+/// restored backup): the tokens of a process begin at its start time.
 fn restore(recovered: Recovered, limits: Limits) -> Result<Pool, NoPool> {
     let snapshot = recovered.snapshot.map(|snapshot| Snapshot::decode(&snapshot.payload)).transpose();
     let snapshot = snapshot.map_err(NoPool::Snapshot)?;
@@ -87,7 +86,7 @@ mod tests {
         let session = SessionId::from("s");
         let mut highest = 0;
         for life in 0..3 {
-            // Each finds nothing of what the one before had kept.
+            // Each starts without the state of the previous one.
             let (mut pool, _journal) = open_at(&config, &place.path().join(life.to_string()));
             let began = Instant::now();
             let now = || Timestamp(u64::try_from(began.elapsed().as_nanos()).unwrap());

@@ -3,10 +3,10 @@
 //! ```text
 //!   gRPC call ──▶ service/ ──message──▶ actor (Pool of ratn-resources, a clock) ──answer, event──▶ service/
 //!   session's stream ──▶ stream.rs, whose every message is such a call
-//!   durable_actor ──records──▶ journal.rs (ratn-storage) ──durable──▶ outbox ──▶ what tells of them leaves
+//!   durable_actor ──records──▶ journal.rs (ratn-storage) ──durable──▶ outbox ──▶ replies and events are sent
 //! ```
-//! After a restart everything that was acknowledged is as it was: resources, leases with their tokens, what was consumed,
-//! answers by request id; sessions and leases with a time of their own have it once more. Waiting requests have to be made again.
+//! After a restart everything acknowledged is restored: resources, leases with their tokens, consumption, answers by request id. The times of
+//! sessions and of leases with a maximum holding time begin anew. Waiting requests have to be repeated.
 
 mod actor;
 mod config;
@@ -34,16 +34,16 @@ use std::sync::Arc;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-/// The role's name: of its endpoint file, its command and its section of a config.
+/// The role name: for the endpoint file, the command and the config section.
 pub const ROLE: &str = "resource-manager";
 
-/// How an acquire ends.
+/// The result of an acquire.
 type Granted = Result<Lease, tonic::Status>;
 
 /// Serves until `shutdown` is cancelled.
 ///
 /// # Errors
-/// Where its state cannot be had, where it cannot listen or publish its endpoint, or where serving fails.
+/// Its state cannot be opened, it cannot listen or publish its endpoint, or serving fails.
 pub async fn run(
     config: ResourceManagerConfig,
     directory: RuntimeDirectory,
@@ -53,10 +53,10 @@ pub async fn run(
     run_as(live, directory, Serving::default(), metrics, shutdown).await
 }
 
-/// As [`run`], served and counted as its host wants it. Of a config that changes its bounds are taken over.
+/// Like [`run`], with the host's settings for serving and metrics. Limits are updated when the config changes.
 ///
 /// # Errors
-/// As [`run`].
+/// The same as [`run`].
 pub async fn run_as(
     live: watch::Receiver<ResourceManagerConfig>,
     directory: RuntimeDirectory,
@@ -88,7 +88,7 @@ pub async fn run_as(
     tracing::info!(%endpoint, "{ROLE} is ready");
     let served = standby::serve(bound, Services::new().with(service), serving, shutdown, &over).await;
     drop(published);
-    // What was still to be written is on the disk when this has ended.
+    // After this, everything has been written to disk.
     over.cancel();
     let _ = ended.await;
     Ok(served?)

@@ -1,4 +1,4 @@
-//! The providers that listen: each is told what is asked of it.
+//! The listening providers: each is told what it is asked for.
 
 use super::handout::HandOut;
 use super::round::Round;
@@ -12,37 +12,37 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::watch;
 
-/// Looks at resources and providers in one turn: a millisecond or two.
+/// Maximum number of resources and providers read in one turn: a millisecond or two.
 const LOOKS: usize = 10_000;
-/// When there is more to tell, others have their turn for so long.
+/// If there is more to tell, other work gets this much time first.
 const A_MOMENT: Duration = Duration::from_millis(1);
 
-/// What somebody can provide.
+/// What a provider offers.
 #[derive(Debug, Default)]
 pub(super) struct Provisions {
     /// By kind.
     pub(super) kinds: BTreeMap<String, Provision>,
-    /// What all of it has in common.
+    /// Attributes common to all of it.
     pub(super) attributes: BTreeMap<String, Value>,
 }
 
-/// Who can provide.
+/// A provider.
 #[derive(Debug)]
 pub(super) struct Provider {
     pub(super) session: SessionId,
     provisions: Provisions,
-    /// Kinds of which there can only be so many for now.
+    /// Temporary maximum numbers of some kinds.
     bounds: BTreeMap<String, u32>,
     listener: watch::Sender<Vec<Demand>>,
 }
 
 impl Provider {
-    /// Of how many more it can be asked; nothing where none that it has would do.
+    /// How many more it can be asked for; `None` if nothing that it offers would satisfy the demand.
     pub(super) fn room(&self, demand: &ratn_resources::Demand, provided: u32) -> Option<u32> {
         self.room_of(demand, provided, |_| true)
     }
 
-    /// The same for those who wait for what is held.
+    /// The same for requests that wait for held resources.
     pub(super) fn room_to_grow(&self, demand: &ratn_resources::Demand, provided: u32) -> Option<u32> {
         self.room_of(demand, provided, |provision| provision.grows)
     }
@@ -57,7 +57,7 @@ impl Provider {
         kinds.map(most).reduce(u32::saturating_add).map(|most| most.saturating_sub(provided))
     }
 
-    /// What is asked of it, if that is something else than before.
+    /// Tells it what it is asked for, if that has changed.
     pub(super) fn tell(&self, told: Vec<Demand>) {
         self.listener.send_if_modified(|before| {
             let changed = *before != told;
@@ -70,33 +70,32 @@ impl Provider {
 /// See the module.
 #[derive(Debug)]
 pub(super) struct Providers {
-    /// The first to come is asked first.
+    /// Providers in order of arrival; the first is asked first.
     all: Vec<Provider>,
     hand_out: HandOut,
-    /// In which they are being told.
+    /// The round in which they are being told.
     round: Option<Round>,
-    /// What any of them can provide.
+    /// What any of them offers.
     provided: Arc<Provided>,
-    /// Something is to be told that nobody was told yet.
+    /// Something has changed that the providers have not been told.
     news: bool,
 }
 
 impl Providers {
-    /// Nobody yet; each has so long to come closer to what is asked of it. A request waits so long for what is held before they are asked
-    /// for more.
+    /// No providers yet. Each has `patience` to make progress. After a request has waited `grow_after` for held resources, they are asked for more.
     pub(super) fn new(patience: Duration, grow_after: Duration) -> Providers {
         let provided = Arc::new(Provided { patience: grow_after, ..Provided::default() });
         Providers { all: Vec::new(), hand_out: HandOut::new(patience), round: None, provided, news: false }
     }
 
-    /// One more listens; how many there are where that is `most` already.
+    /// Adds a provider; an error with the number of providers if that is `most` already.
     pub(super) fn join(
         &mut self,
         session: SessionId,
         provisions: Provisions,
         most: usize,
     ) -> Result<watch::Receiver<Vec<Demand>>, usize> {
-        // Those that are gone are forgotten with the next round.
+        // Closed ones are removed in the next round.
         let there = self.all.iter().filter(|provider| !provider.listener.is_closed()).count();
         if there >= most {
             return Err(there);
@@ -108,14 +107,14 @@ impl Providers {
         Ok(told)
     }
 
-    /// Whether a session is asked for a kind.
+    /// Whether a session provides a kind.
     pub(super) fn provides(&self, session: &SessionId, kind: &str) -> bool {
         let is_asked =
             |provider: &&Provider| !provider.listener.is_closed() && provider.provisions.kinds.contains_key(kind);
         self.all.iter().filter(is_asked).any(|provider| provider.session == *session)
     }
 
-    /// Of this kind there can only be so many of a provider for now, or as many as it said at first.
+    /// Limits a provider to `most` of this kind for now; `None` restores its original number.
     pub(super) fn bound(&mut self, session: &SessionId, kind: &str, most: Option<u32>) {
         for provider in self.all.iter_mut().filter(|provider| provider.session == *session) {
             match most {
@@ -126,7 +125,7 @@ impl Providers {
         self.news = true;
     }
 
-    /// What anybody may be asked for.
+    /// What the providers may be asked for.
     pub(super) fn provided(&self) -> &Arc<Provided> {
         &self.provided
     }
@@ -141,13 +140,13 @@ impl Providers {
         }
     }
 
-    /// When something changes by time alone, or there is more to tell than a turn could.
+    /// When something changes by time alone, or when to continue a round.
     pub(super) fn deadline(&self, now: Timestamp) -> Option<Timestamp> {
         let more = self.round.is_some() || self.news;
         more.then_some(now + A_MOMENT).or_else(|| self.hand_out.deadline())
     }
 
-    /// Whether something is to be told though nothing else is missing than before.
+    /// Whether something has to be told although the demand is unchanged.
     fn are_due(&self, now: Timestamp) -> bool {
         let deadline = self.hand_out.deadline();
         self.news
@@ -155,12 +154,12 @@ impl Providers {
             || (deadline.is_some() && self.all.iter().any(|provider| provider.listener.is_closed()))
     }
 
-    /// Something else is missing than before: everybody is told.
+    /// The demand has changed: everybody has to be told.
     pub(super) fn are_to_be_told(&mut self) {
         self.news = true;
     }
 
-    /// Tells each what of this is asked of it, where there is something to tell: as much as goes into a turn.
+    /// Tells each provider what it is asked for, if anything has changed: as much as fits into one turn.
     pub(super) fn tell(&mut self, now: Timestamp, pool: &Pool, demands: &[ratn_resources::Demand]) {
         if self.round.is_none() {
             if !self.are_due(now) {
@@ -191,7 +190,7 @@ mod tests {
 
     const NOW: Timestamp = Timestamp(0);
 
-    /// Sessions `0`, `1`, ... that each provide so many planners on a host of their own, and listen.
+    /// Sessions `0`, `1`, ... that listen and each provide `planners` planners on their own host.
     fn providers(count: usize, planners: usize) -> (Pool, Providers, Vec<watch::Receiver<Vec<Demand>>>) {
         let mut pool = Pool::new(Limits::default());
         let mut providers = Providers::new(Duration::from_secs(15), Duration::from_millis(250));
@@ -212,7 +211,7 @@ mod tests {
         (pool, providers, told)
     }
 
-    /// So many selectors of planners, each of which lacks one.
+    /// `count` selectors of planners, each lacking one.
     fn demands(count: usize) -> Vec<ratn_resources::Demand> {
         let demand = |number: usize| {
             let mut requirement = Requirement::new(ResourceOperation::Block, "Planner");
@@ -222,7 +221,7 @@ mod tests {
         (0..count).map(demand).collect()
     }
 
-    /// What each is told in the end, and how many turns that takes.
+    /// Runs a complete round; returns the number of turns.
     fn turns(pool: &Pool, providers: &mut Providers, demands: &[ratn_resources::Demand]) -> usize {
         providers.are_to_be_told();
         let mut turns = 0;
@@ -237,8 +236,8 @@ mod tests {
     fn what_many_providers_are_told_of_many_selectors_is_told_over_several_turns() {
         let (pool, mut providers, told) = providers(256, 16);
         let demands = demands(256);
-        // 256 selectors times 4,096 resources, which are looked at once for all providers; 256 selectors are handed out to 256 providers,
-        // and 256 are told of those.
+        // 256 selectors times 4,096 resources, each read once for all providers; then 256 selectors are handed out to 256 providers, and each of
+        // these is told.
         let (counted, asked) = (256 * 4_096, 2 * 256 * 257);
         let turns = turns(&pool, &mut providers, &demands);
         assert!(((counted + asked) / LOOKS..(counted + asked) / LOOKS + 30).contains(&turns), "{turns}");
@@ -303,7 +302,7 @@ mod tests {
         };
         turns(&pool, &mut providers, &[arm]);
         assert_eq!((told[0].borrow().len(), late.borrow().len()), (0, 1));
-        // One that has gone is not asked any more, and its kinds are not provided.
+        // A provider that has left is not asked any more, and its kinds are not provided.
         drop(late);
         turns(&pool, &mut providers, &demands);
         assert!(!providers.provided().kinds.contains("Arm"));

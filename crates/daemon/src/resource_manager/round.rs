@@ -1,10 +1,10 @@
-//! A round: what is missing is handed out to the providers, and each is told what is asked of it.
+//! A round: demands are handed out to the providers, and each is told what it is asked for.
 //!
 //! ```text
-//!   begins ──▶ for each demand: count what each provides, hand it out ──▶ tell each provider ──▶ over
+//!   begins ──▶ for each demand: count what each provides, hand it out ──▶ tell each provider ──▶ ends
 //! ```
-//! With hundreds of selectors, providers and thousands of resources that takes long, so a turn does a part of it and the next one goes
-//! on. What comes up meanwhile is for the next round.
+//! With hundreds of selectors and providers and thousands of resources this takes long, so each turn does a part of it. Changes in the meantime are
+//! left for the next round.
 
 use super::handout::{HandOut, Missing, Part};
 use super::providers::Provider;
@@ -18,13 +18,13 @@ use ratn_resources::{Pool, ProvidedCount, SessionId};
 #[derive(Debug)]
 pub(super) struct Round {
     demands: Vec<ratn_resources::Demand>,
-    /// Of the providers that it is for.
+    /// The sessions of the providers in the round.
     sessions: Vec<SessionId>,
-    /// Of the first demands, what is asked of each provider, and what it provides of it.
+    /// For the demands handed out so far: what each provider is asked for, and what it provides already.
     handed_out: Vec<Vec<Asked>>,
-    /// Of the next one, what was counted so far.
+    /// For the next demand: the count so far.
     counted: Option<ProvidedCount>,
-    /// So many providers were told.
+    /// The number of providers that were told.
     told: usize,
 }
 
@@ -42,7 +42,7 @@ impl Asked {
 }
 
 impl Round {
-    /// Of what is missing now, for these providers.
+    /// Begins a round with the present demands, for these providers.
     pub(super) fn begin(providers: &[Provider], demands: &[ratn_resources::Demand], hand_out: &mut HandOut) -> Round {
         let sessions: Vec<SessionId> = providers.iter().map(|provider| provider.session.clone()).collect();
         hand_out.begin(&sessions);
@@ -50,7 +50,7 @@ impl Round {
         Round { demands, sessions, handed_out: Vec::new(), counted: None, told: 0 }
     }
 
-    /// Goes on by about so many looks at resources and providers; whether it is over.
+    /// Continues with about `looks` reads of resources and providers; returns whether the round has ended.
     pub(super) fn go_on(
         &mut self,
         now: Timestamp,
@@ -98,7 +98,7 @@ impl Round {
     }
 }
 
-/// What is asked of each provider for one demand: what is missing, and of those that grow what is waited for beside it.
+/// What each provider is asked for one demand: what is missing, and from growing providers also what is queued for.
 fn handed_out(
     now: Timestamp,
     demand: &ratn_resources::Demand,
@@ -106,7 +106,7 @@ fn handed_out(
     hand_out: &mut HandOut,
 ) -> Vec<Asked> {
     let selector = format!("{:?}", Requirement { count: Quantity::ONE, ..demand.requirement.clone() });
-    // Whole resources are provided, also for parts of them.
+    // Providers provide whole resources, also for fractions.
     let (missing, queued) = (demand.requirement.count.units_up(), demand.queued.units_up());
     let mut handed_out = |selector: &str, count: u32, room: &dyn Fn(usize, &Provider) -> Option<u32>| {
         if count == 0 {
@@ -117,7 +117,7 @@ fn handed_out(
         hand_out.hand_out(now, sessions, &Missing { selector: selector.into(), count, of })
     };
     let handed_out_missing = handed_out(&selector, missing, &|index, provider| provider.room(demand, provided[index]));
-    // Who waits for more than exists waits for what is held as well.
+    // Those who wait for more than exists also wait for held resources.
     let more = queued.saturating_sub(missing);
     let handed_out_queued = handed_out(&format!("{selector}, held"), more, &|index, provider| {
         let room = provider.room_to_grow(demand, provided[index])?;
@@ -127,7 +127,7 @@ fn handed_out(
     handed_out_missing.iter().copied().zip(handed_out_queued).zip(provided).map(asked).collect()
 }
 
-/// What a provider provides says where it is, once it is there: who asks for that is asked for like everybody else.
+/// A resource gets its endpoint only when it exists: demand that requires an endpoint is treated like any other.
 fn of_performers(mut demand: ratn_resources::Demand) -> ratn_resources::Demand {
     demand.requirement.conditions.retain(|condition| *condition != Condition::has(ENDPOINT_ATTRIBUTE));
     demand

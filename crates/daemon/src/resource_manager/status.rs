@@ -5,7 +5,7 @@ use ratn_resources::{Compacted, PoolError, Refusal};
 use std::time::Duration;
 use tonic::{Code, Status};
 
-/// When to try again after a bound was reached.
+/// When to retry after a limit was reached.
 const RETRY_DELAY: Duration = Duration::from_millis(100);
 
 pub(super) fn of_error(error: &PoolError) -> Status {
@@ -36,7 +36,7 @@ pub(super) fn of_error(error: &PoolError) -> Status {
     status(code, reason, error.to_string())
 }
 
-/// A caller that is no operator says no session.
+/// A caller who is not an operator names no session.
 pub(super) fn without_session(who: &str) -> Status {
     status(Code::PermissionDenied, "NOT_YOURS", format!("{who} says no session: only an operator may do that"))
 }
@@ -50,7 +50,7 @@ pub(super) fn of_refusal(refusal: &Refusal) -> Status {
     status(code, reason, format!("not granted: {refusal}"))
 }
 
-/// For programs `oldest_revision` and `newest_revision`: from between them a watch can go on.
+/// Contains `oldest_revision` and `newest_revision` for programs: a watch can continue from revisions between them.
 pub(super) fn of_compacted(compacted: &Compacted) -> Status {
     let known = [("oldest_revision", compacted.oldest), ("newest_revision", compacted.newest)];
     let known = known.map(|(name, revision)| (name, revision.0.to_string()));

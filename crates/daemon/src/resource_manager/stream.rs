@@ -1,5 +1,5 @@
-//! The calls of a session's stream, each as if it had come on its own, from the stream's caller. Dropped, they leave the queue as
-//! unary calls do; so does one of which the client says that it dropped it, also when its answer was under way to the client.
+//! The calls on a session's stream, each treated as a separate call from the stream's caller. Dropped calls leave the queue as unary calls do; so
+//! does a call that its client reports as dropped, also when its answer was under way to the client.
 
 use super::service::Service;
 use crate::access::Caller;
@@ -22,13 +22,13 @@ use std::time::Instant;
 use tonic::{Code, Status};
 use tracing::Instrument;
 
-/// What a withdraw on a stream counts as.
+/// The method as which a withdraw on a stream counts.
 const WITHDRAW: &str = "/ratn.v1.ResourceService/Withdraw";
 
-/// Grants of a stream that are known by the ids of their calls: more than can be under way to a client that reads.
+/// Number of grants of a stream that are remembered by call id: more than can be under way to a client that reads.
 const GRANTS: usize = 4_096;
 
-/// What performs the calls of one caller.
+/// Performs the calls of one caller.
 #[derive(Debug)]
 pub(super) struct CallerService {
     service: Service,
@@ -36,11 +36,11 @@ pub(super) struct CallerService {
     grants: Grants,
 }
 
-/// Which call of the stream was answered with which lease: the newest ones.
+/// Which call of the stream was answered with which lease: the newest grants.
 #[derive(Debug, Default)]
 struct Grants {
     leases: BTreeMap<u64, LeaseId>,
-    /// The oldest first.
+    /// Oldest first.
     order: VecDeque<u64>,
 }
 
@@ -86,8 +86,8 @@ impl Serve<SessionCalls> for CallerService {
         }
     }
 
-    /// The client dropped a call. Where its answer was under way, the lease goes back as from a unary call that is dropped: unless another
-    /// call of the same request got it, and the client heard that.
+    /// The client dropped a call. If its answer was under way, the lease is returned as for a dropped unary call, unless another call with the same
+    /// request id got it and the client received that answer.
     fn end(&mut self, ended: u64, by: Asked, end: impl FnOnce() -> bool) -> Option<Result<Kind, Status>> {
         let Asked::Withdraw(v1::WithdrawRequest { request_id, session_id, unheard, .. }) = by else { return None };
         if let Err(malformed) = name(&request_id, "request_id").and_then(|()| name(&session_id, "session_id")) {
@@ -100,7 +100,7 @@ impl Serve<SessionCalls> for CallerService {
             audit::begin(&self.caller.caller, &request_id, withdraw).ended(&Ok(()));
             withdrawn = true;
         }
-        // The end of a call was counted with the call. What counts anew is refused before it makes any work.
+        // The end of a call was counted with the call. A withdraw that counts separately may be refused before it causes any work.
         let StreamCaller { caller, quotas, .. } = &self.caller;
         let counts = quotas.as_ref().filter(|_| !withdrawn);
         if let Some(Err(refused)) = counts.map(|quotas| quotas.admit(caller, WITHDRAW, Instant::now())) {

@@ -3,7 +3,7 @@
 use ratn_resources::ResourceView;
 use std::collections::BTreeSet;
 
-/// All of them where a set is empty; where both are not, those that are in both.
+/// An empty set matches everything; two non-empty sets match what is in both.
 #[derive(Debug, Default)]
 pub(super) struct WatchFilter {
     pub(super) kinds: BTreeSet<String>,
@@ -11,7 +11,7 @@ pub(super) struct WatchFilter {
 }
 
 impl WatchFilter {
-    /// Whether it is about a resource.
+    /// Whether it matches a resource.
     pub(super) fn passes(&self, resource: &ResourceView) -> bool {
         (self.kinds.is_empty() || self.kinds.contains(&resource.kind))
             && (self.resources.is_empty() || self.resources.contains(&resource.id))

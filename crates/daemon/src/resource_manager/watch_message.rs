@@ -1,5 +1,5 @@
-//! Messages to watches, in the types of the pool. The wire's messages are made of it where they are sent: the holders of a resource that
-//! thousands of leases hold are in every event of it, and the actor has no time for that.
+//! Messages to watches, in the pool's types. They are converted to wire messages where they are sent: every event of a resource contains all its
+//! holders, perhaps thousands of leases, which would take too much of the actor's time.
 
 use super::watch_filter::WatchFilter;
 use super::wire;
@@ -11,14 +11,14 @@ use std::sync::Arc;
 /// See the module.
 #[derive(Debug, Clone)]
 pub(super) enum WatchMessage {
-    /// What is there, of what a watch is about; events follow from the next revision on.
+    /// The resources that match the watch; events follow from the next revision on.
     Snapshot { revision: Revision, resources: Vec<ResourceView>, youngest: LeaseId },
-    /// What happened since.
+    /// A later change.
     Event(Arc<WatchEvent>),
 }
 
 impl WatchMessage {
-    /// Whether some of it is what a watch is about. A snapshot was made for it.
+    /// Whether it contains anything that matches the watch. A snapshot always does.
     pub(super) fn concerns(&self, filter: &WatchFilter) -> bool {
         match self {
             WatchMessage::Snapshot { .. } => true,
@@ -26,7 +26,7 @@ impl WatchMessage {
         }
     }
 
-    /// What a watch is told of an event: what it is about, behind what it has seen. A snapshot is told in parts.
+    /// The updates in an event: what matches the watch and comes after its position. Snapshots are sent in parts elsewhere.
     pub(super) fn updates(&self, filter: &WatchFilter, after: Option<WatchPosition>) -> Vec<ResourceUpdate> {
         match self {
             WatchMessage::Snapshot { .. } => Vec::new(),

@@ -1,4 +1,4 @@
-//! The pool's views and events as the wire's.
+//! Converts the pool's views and events to wire types.
 
 use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
@@ -52,12 +52,12 @@ pub(super) fn resource(view: &ResourceView) -> Resource {
     }
 }
 
-/// A lease as its holder gets it.
+/// A lease for its holder.
 pub(super) fn lease(lease: Lease, session_id: String) -> v1::Lease {
     v1::Lease { session_id, ..lease.into() }
 }
 
-/// One event of the pool may touch several resources: one event each, all of one revision.
+/// One event of the pool may affect several resources: it becomes one event for each, with the same revision.
 pub(super) fn events(event: &WatchEvent, wanted: impl Fn(&ResourceView) -> bool) -> Vec<ResourceEvent> {
     use ResourceEventKind::{Created, Deleted, Leased, Released, Updated};
     let revision = event.revision;
@@ -102,7 +102,7 @@ pub(super) fn passes(view: &ResourceView, filter: &ResourceFilter) -> bool {
         && filter.conditions.iter().all(|condition| view.meets(condition))
 }
 
-/// Leases and resources of a session that are named.
+/// Maximum number of leases and resources listed for a session.
 pub(super) const NAMED: usize = 1_000;
 
 pub(super) fn session(view: SessionView, now: Timestamp) -> SessionStatus {
@@ -120,7 +120,7 @@ pub(super) fn session(view: SessionView, now: Timestamp) -> SessionStatus {
     }
 }
 
-/// Negative where it has passed.
+/// Negative if overdue.
 fn due_in_ms(due: Timestamp, now: Timestamp) -> i64 {
     let whole = |time: Duration| i64::try_from(time.as_millis()).unwrap_or(i64::MAX);
     whole(due.since(now)) - whole(now.since(due))

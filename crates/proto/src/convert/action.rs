@@ -7,7 +7,7 @@ use ratn_model::id::ProjectionId;
 use ratn_model::resource::Lease;
 use std::collections::BTreeMap;
 
-/// A goal keeps no more of its outputs than an action may have ports.
+/// Maximum number of outputs to keep: the maximum number of ports of an action.
 const MAX_KEPT: usize = 128;
 
 impl From<Goal> for v1::Goal {

@@ -1,14 +1,14 @@
-//! What a worker says of itself.
+//! Descriptions of workers.
 
 use crate::v1;
 use prost::Message;
 use ratn_model::catalogue::{ActionSignature, Annotations, DescriptionError, WorkerDescription};
 use std::collections::BTreeMap;
 
-/// Bytes of a description on the wire.
+/// Maximum size of a description on the wire.
 pub const MAX_DESCRIPTION_BYTES: usize = 65_536;
 
-/// Whether a description is as small as who asks for it takes it.
+/// Checks that a description is small enough for its readers.
 ///
 /// # Errors
 /// [`DescriptionError::TooLarge`].
@@ -74,7 +74,7 @@ impl From<v1::ActionAnnotations> for Annotations {
 impl TryFrom<v1::DescribeResponse> for WorkerDescription {
     type Error = DescriptionError;
 
-    /// Only what is within the bounds.
+    /// Accepts only descriptions within the limits.
     fn try_from(said: v1::DescribeResponse) -> Result<WorkerDescription, DescriptionError> {
         let mut actions = BTreeMap::new();
         for action in said.actions {
@@ -122,7 +122,7 @@ fn once<T>(action: &str, before: Option<T>, port: String) -> Result<(), Descript
     before.map_or(Ok(()), |_| Err(twice()))
 }
 
-/// What somebody else wrote, as much as a message has room for.
+/// A text from outside, cut to fit into a message.
 fn shown(said: &str) -> String {
     said.chars().take(64).map(|c| if c.is_control() { '?' } else { c }).collect()
 }

@@ -1,7 +1,7 @@
-//! To and from the wire: `From<T> for v1::T` never fails, `TryFrom<v1::T> for T` says what is wrong and where.
+//! Conversions to and from the wire: `From<T> for v1::T` never fails, `TryFrom<v1::T> for T` says what is wrong and where.
 //!
-//! What the schema cannot say is checked here, so that no core ever sees it: a choice that is not made, a number that is
-//! not finite, a pose that is none, a trajectory that runs backwards, names without bound, nesting without end.
+//! What the schema cannot express is checked here, so that no core ever sees it: a missing choice, a number that is not finite, an invalid pose, a
+//! trajectory that runs backwards, names without limit, nesting without end.
 
 mod action;
 mod describe;
@@ -23,18 +23,18 @@ use crate::v1;
 pub use describe::{MAX_DESCRIPTION_BYTES, check_size};
 pub use scene::digest;
 
-/// Lists and maps nest at most this deep.
+/// Maximum nesting depth of lists and maps.
 pub const MAX_DEPTH: usize = 16;
-/// A value has at most this many elements, over all its lists and maps.
+/// Maximum number of elements of a value, over all its lists and maps.
 pub const MAX_ELEMENTS: usize = 200_000;
-/// Ids, kinds, predicates and port names have at most this many bytes.
+/// Maximum number of bytes of ids, kinds, predicates and port names.
 pub const MAX_NAME_BYTES: usize = 1024;
 
-/// A message that fits the schema and still means nothing.
+/// A message that matches the schema but is invalid.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{path}: {problem}")]
 pub struct Malformed {
-    /// The field, from the message down: `goal.inputs[start].joints[2]`.
+    /// The path of the field in the message: `goal.inputs[start].joints[2]`.
     pub path: String,
     /// What is wrong with it, and what would be right.
     pub problem: String,
@@ -46,7 +46,7 @@ impl Malformed {
         Malformed { path: field.to_string(), problem: problem.into() }
     }
 
-    /// The same problem as seen from the message around it.
+    /// The same problem, with the path extended by the enclosing field.
     #[must_use]
     pub fn within(mut self, field: impl fmt::Display) -> Malformed {
         let dot = if self.path.is_empty() || self.path.starts_with('[') { "" } else { "." };
@@ -61,10 +61,10 @@ impl From<Malformed> for tonic::Status {
     }
 }
 
-/// A message field that must be there, converted.
+/// Converts a required message field.
 ///
 /// # Errors
-/// [`Malformed`] when it is missing, or as its conversion.
+/// [`Malformed`] if it is missing or cannot be converted.
 pub fn required<W, T>(message: Option<W>, field: &str) -> Result<T, Malformed>
 where
     T: TryFrom<W, Error = Malformed>,
@@ -73,13 +73,13 @@ where
     T::try_from(message).map_err(|malformed| malformed.within(field))
 }
 
-/// What a question selects by: a list that is longer would cost others more than its length says.
+/// Maximum number of selectors in a request: a longer list would cost others more than its length suggests.
 pub const MAX_SELECTED: usize = 256;
 
-/// That a list of what is selected by has at most [`MAX_SELECTED`] elements.
+/// Checks that a list of selectors has at most [`MAX_SELECTED`] elements.
 ///
 /// # Errors
-/// [`Malformed`] where it has more.
+/// [`Malformed`] if it has more.
 pub fn few(count: usize, field: &str) -> Result<(), Malformed> {
     if count <= MAX_SELECTED {
         return Ok(());
@@ -87,10 +87,10 @@ pub fn few(count: usize, field: &str) -> Result<(), Malformed> {
     Err(Malformed::new(field, format!("has {count} elements: at most {MAX_SELECTED} are allowed, ask more than once")))
 }
 
-/// Every element of a repeated field, converted.
+/// Converts every element of a repeated field.
 ///
 /// # Errors
-/// [`Malformed`] of the first that cannot be.
+/// [`Malformed`] for the first element that cannot be converted.
 pub fn each<W, T>(messages: Vec<W>, field: &str) -> Result<Vec<T>, Malformed>
 where
     T: TryFrom<W, Error = Malformed>,
@@ -99,22 +99,22 @@ where
     messages.into_iter().enumerate().map(convert).collect()
 }
 
-/// A repeated field from the cores' types.
+/// Converts items to a repeated field.
 pub fn all<T, W: From<T>>(items: impl IntoIterator<Item = T>) -> Vec<W> {
     items.into_iter().map(W::from).collect()
 }
 
-/// The bytes that a value has on the wire.
+/// The size of a value on the wire, in bytes.
 pub fn value_bytes(value: &v1::Value) -> usize {
     value.encoded_len()
 }
 
-/// The bytes that ports have on the wire, nearly.
+/// The approximate size of ports on the wire, in bytes.
 pub fn ports_bytes(fields: &BTreeMap<String, v1::Value>) -> usize {
     fields.iter().map(|(name, value)| name.len() + value.encoded_len()).sum()
 }
 
-/// Hands out the wire form of ports, in the order of names, for a fingerprint of them.
+/// Passes the wire form of ports to `take`, ordered by name, for a fingerprint.
 pub fn wire_form(fields: &BTreeMap<String, v1::Value>, mut take: impl FnMut(&[u8])) {
     for (name, value) in fields {
         let value = value.encode_to_vec();
@@ -125,10 +125,10 @@ pub fn wire_form(fields: &BTreeMap<String, v1::Value>, mut take: impl FnMut(&[u8
     }
 }
 
-/// Ports or attributes.
+/// Converts ports or attributes.
 ///
 /// # Errors
-/// [`Malformed`] of the first that is none, and where all together have more than [`MAX_PORTS_BYTES`].
+/// [`Malformed`] for the first invalid one, or if all together exceed [`MAX_PORTS_BYTES`].
 pub fn ports(fields: BTreeMap<String, v1::Value>, field: &str) -> Result<BTreeMap<String, Value>, Malformed> {
     let bytes = ports_bytes(&fields);
     if bytes > MAX_PORTS_BYTES {
@@ -145,12 +145,12 @@ pub fn ports(fields: BTreeMap<String, v1::Value>, field: &str) -> Result<BTreeMa
     fields.into_iter().map(convert).collect()
 }
 
-/// Ports or attributes onto the wire.
+/// Converts ports or attributes to the wire.
 pub fn wire_ports(fields: BTreeMap<String, Value>) -> BTreeMap<String, v1::Value> {
     fields.into_iter().map(|(name, value)| (name, value.into())).collect()
 }
 
-/// A name that must be there: not empty, not endless, nothing in it that a terminal would obey.
+/// Checks a required name: not empty, not too long, and without characters that terminals interpret.
 ///
 /// # Errors
 /// [`Malformed`] otherwise.
@@ -161,10 +161,10 @@ pub fn name(text: &str, field: &str) -> Result<(), Malformed> {
     label(text, field)
 }
 
-/// As [`name`], but may be empty.
+/// Like [`name`], but may be empty.
 ///
 /// # Errors
-/// [`Malformed`] when it is too long or holds characters that are not seen.
+/// [`Malformed`] if it is too long or has invisible characters.
 pub fn label(text: &str, field: &str) -> Result<(), Malformed> {
     if text.len() > MAX_NAME_BYTES {
         return Err(Malformed::new(field, format!("has {} bytes: at most {MAX_NAME_BYTES} are allowed", text.len())));
@@ -180,26 +180,26 @@ pub fn label(text: &str, field: &str) -> Result<(), Malformed> {
     Ok(())
 }
 
-/// Names in a list.
+/// Checks a list of names.
 ///
 /// # Errors
-/// [`Malformed`] of the first that is none.
+/// [`Malformed`] for the first invalid one.
 pub fn names(texts: &[String], field: &str) -> Result<(), Malformed> {
     texts.iter().enumerate().try_for_each(|(i, text)| name(text, &format!("{field}[{i}]")))
 }
 
-/// That texts are kinds that a resource can have.
+/// Checks that texts are valid kinds of resources.
 ///
 /// # Errors
-/// [`Malformed`] of the first that is none.
+/// [`Malformed`] for the first invalid one.
 pub fn kinds(texts: &[String], field: &str) -> Result<(), Malformed> {
     texts.iter().enumerate().try_for_each(|(i, text)| kind(text, &format!("{field}[{i}]")))
 }
 
-/// That a text is a kind that a resource can have.
+/// Checks that a text is a valid kind of a resource.
 ///
 /// # Errors
-/// [`Malformed`] where it is none.
+/// [`Malformed`] if it is not.
 pub fn kind(text: &str, field: &str) -> Result<(), Malformed> {
     name(text, field)?;
     if is_kind(text) { Ok(()) } else { Err(Malformed::new(field, format!("is `{text}`: it must be {KIND_RULE}"))) }

@@ -1,4 +1,4 @@
-//! Scenes, as what they differ by from ones that are known.
+//! Scenes, as differences from known ones.
 
 use super::{Malformed, each, missing_choice, required};
 use crate::v1;
@@ -8,10 +8,10 @@ use ratn_world::digest::Digest;
 use ratn_world::scene::delta::SceneDelta;
 use ratn_world::scene::{Placement, SceneObject, Shape};
 
-/// A digest of its bytes.
+/// A digest from its bytes.
 ///
 /// # Errors
-/// Where they are not 32.
+/// There are not exactly 32 bytes.
 pub fn digest(bytes: &[u8], field: &str) -> Result<Digest, Malformed> {
     let wrong = |_| Malformed::new(field, format!("has {} bytes: a digest has 32", bytes.len()));
     bytes.try_into().map(Digest::from_bytes).map_err(wrong)
@@ -62,7 +62,7 @@ fn wire(individual: Term, object: &SceneObject) -> v1::SceneObject {
     }
 }
 
-/// An individual where it is.
+/// An individual with its object.
 struct Placed((Term, SceneObject));
 
 impl TryFrom<v1::SceneObject> for Placed {

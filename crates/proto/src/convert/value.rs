@@ -7,7 +7,7 @@ use ratn_model::pose::Pose;
 use ratn_model::value::{Trajectory, TrajectoryPoint, Value};
 use std::collections::BTreeMap;
 
-/// How far the length of a pose's quaternion may be from one.
+/// Maximum deviation of the length of a pose's quaternion from 1.
 const QUATERNION_TOLERANCE: f64 = 0.01;
 
 impl From<Value> for v1::Value {
@@ -39,7 +39,7 @@ impl TryFrom<v1::Value> for Value {
     }
 }
 
-/// Reads a value `depth` lists or maps down; `budget` is the number of elements that are still allowed.
+/// Reads a value at nesting depth `depth`; `budget` is the remaining number of elements.
 fn read(value: v1::Value, depth: usize, budget: &mut usize) -> Result<Value, Malformed> {
     let mut room = |elements: usize| {
         if depth == MAX_DEPTH {

@@ -1,4 +1,4 @@
-//! What is told of the root world: revisions as they are made, what differs between two, what a fact was.
+//! Reports about the root world: new revisions, differences between two, and the history of a fact.
 
 use super::{Malformed, all, each, label, missing_choice, required};
 use crate::types::{Contradiction, FactDifference, FactRecord, FactVersion, WorldChange, WorldUpdate};
@@ -125,7 +125,7 @@ impl TryFrom<v1::Contradiction> for Contradiction {
     }
 }
 
-/// A writer as the wire says it: empty is nobody.
+/// The writer on the wire; empty for none.
 fn said(writer: Option<Arc<str>>) -> String {
     writer.map_or_else(String::new, |writer| writer.to_string())
 }

@@ -13,7 +13,7 @@ from ratn._trace import State, Trace
 
 
 class Annotations(typing.TypedDict, total=False):
-    """What is said of a state that performs an action, as keyword arguments: the keys of a task file."""
+    """The annotations of a state that performs an action, as keyword arguments: the keys of a task file."""
 
     name: str | None
     inputs: Mapping[str, object]
@@ -128,7 +128,7 @@ _NOTHING = object()
 def output(
     value: object = _NOTHING, *, each: object = _NOTHING, type: str | None = None, default: object = _NOTHING, description: str | None = None
 ) -> Output:
-    """An output of a task or block with a type, a default or a description; of a loop also the list of a value of each iteration, ``each=``."""
+    """An output of a task or block with a type, a default or a description. For a loop, ``each=`` gives the list of a value's results, one per iteration."""
     if (value is _NOTHING) == (each is _NOTHING):
         raise TypeError("an output has a value, or of a loop `each=`")
     is_of_each = value is _NOTHING
@@ -137,20 +137,20 @@ def output(
 
 
 def block(kind: str, **said: Any) -> dict[str, Any]:
-    """A resource to itself while the state runs: ``ratn.block("Arm", count=1, where={"tool": "welder"})``."""
+    """Blocks a resource exclusively while the state runs: ``ratn.block("Arm", count=1, where={"tool": "welder"})``."""
     return {"block": kind, **said}
 
 
 def consume(kind: str, **said: Any) -> dict[str, Any]:
-    """A resource for the rest of the run: ``ratn.consume("Battery", count=0.2)``."""
+    """Consumes a resource for the rest of the run: ``ratn.consume("Battery", count=0.2)``."""
     return {"consume": kind, **said}
 
 
 def create(kind: str, **said: Any) -> dict[str, Any]:
-    """A resource of the task that there is once the state has become real."""
+    """A resource of the task that is created when the state is committed."""
     return {"create": kind, "class": "task", **said}
 
 
 def delete(kind: str, **said: Any) -> dict[str, Any]:
-    """A resource of the task that there is no more once the state has become real."""
+    """A resource of the task that is deleted when the state is committed."""
     return {"delete": kind, **said}

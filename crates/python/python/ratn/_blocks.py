@@ -155,16 +155,16 @@ class Concurrency(Block):
 
 
 def sequence(name: str | None = None, **annotations: Any) -> Ordered:
-    """States in order as one state: ``with ratn.sequence("think", routine=True) as think:``."""
+    """A hierarchy: states in sequence as one state: ``with ratn.sequence("think", routine=True) as think:``."""
     return Ordered("sequence", name, annotations, {}, "sequence")
 
 
 def retry(
     times: int | None = None, *, on: Iterable[str] | None = None, backoff: float | None = None, name: str | None = None, **annotations: Any
 ) -> Retry:
-    """What is inside is tried again, so many times after the first: ``with ratn.retry(3):``.
+    """Repeats the block after a failure, at most ``times`` times after the first try: ``with ratn.retry(3):``.
 
-    ``on`` are the outcomes after which it is (``aborted`` unless given), ``backoff`` the seconds before the second try.
+    ``on`` are the outcomes that cause a repetition (default ``aborted``), ``backoff`` the pause before the second try, in seconds.
     """
     said: dict[str, Any] = {} if times is None else {"times": times}
     if backoff is not None:
@@ -181,7 +181,7 @@ def _condition(condition: object) -> Any:
 
 
 def when(condition: object, *, name: str | None = None, **annotations: Any) -> Condition:
-    """What is inside is done where the condition is true: ``with ratn.when(fn.len(look.boxes) > 0):``. A text is an expression."""
+    """Performs the block if the condition is true: ``with ratn.when(fn.len(look.boxes) > 0):``. A string is an expression."""
     return Condition("when", name, annotations, {"condition": _condition(condition)}, "condition")
 
 
@@ -202,7 +202,7 @@ class _Otherwise:
 
 
 def otherwise() -> _Otherwise:
-    """What is done where the condition of the ``ratn.when`` before it is not true."""
+    """Performs the block if the condition of the previous ``ratn.when`` is not true."""
     return _Otherwise()
 
 
@@ -223,7 +223,7 @@ class _Lastly:
 
 
 def lastly() -> _Lastly:
-    """What is done on every way out of the state or block before it: ``finally`` in a task file."""
+    """Performs the block on every way out of the state or block before it: ``finally`` in a task file."""
     return _Lastly()
 
 
@@ -276,15 +276,15 @@ class Each(Iterator[Any]):
 
 
 def each(elements: object, *, variable: str | None = None, index: str | bool | None = None, name: str | None = None, **annotations: Any) -> Each:
-    """The elements of a list that is known only while the task runs: ``for box in ratn.each(look.boxes):``.
+    """Iterates over a list that is known only while the task runs: ``for box in ratn.each(look.boxes):``.
 
-    With ``index=True`` also their numbers: ``for i, box in ratn.each(look.boxes, index=True):``.
+    With ``index=True`` also yields the indices: ``for i, box in ratn.each(look.boxes, index=True):``.
     """
     return Each(elements, variable, index, name, annotations)
 
 
 def collect(value: object, *, name: str | None = None, type: str | None = None) -> Value:
-    """Inside of a loop: the list of what the value is at the end of each iteration, for what comes after the loop. ``seen = ratn.collect(look.boxes)``."""
+    """Inside of a loop: the list of the value's results at the end of each iteration, for use after the loop: ``seen = ratn.collect(look.boxes)``."""
     at = user_line()
     trace = Trace.now("`ratn.collect`")
     place = trace.collects()
@@ -312,20 +312,20 @@ def _loop(key: str, function: str, condition: object, index: str | None, name: s
 
 
 def while_(condition: object, *, index: str | None = None, name: str | None = None, **annotations: Any) -> Loop:
-    """What is inside is done while the condition is true, which is looked at before each time: ``with ratn.while_(tries < 3) as loop:``."""
+    """Repeats the block while the condition is true, which is checked before each iteration: ``with ratn.while_(tries < 3) as loop:``."""
     return _loop("while", "while_", condition, index, name, annotations)
 
 
 def do_while(condition: object = None, *, index: str | None = None, name: str | None = None, **annotations: Any) -> Loop:
-    """As :func:`while_`, looked at after each time."""
+    """Like :func:`while_`, but the condition is checked after each iteration."""
     return _loop("do_while", "do_while", condition, index, name, annotations)
 
 
 def until(condition: object = None, *, index: str | None = None, name: str | None = None, **annotations: Any) -> Loop:
-    """What is inside is done until the condition is true, which is looked at after each time."""
+    """Repeats the block until the condition is true, which is checked after each iteration."""
     return _loop("until", "until", condition, index, name, annotations)
 
 
 def concurrently(kind: str | int = "barrier", *, name: str | None = None, **annotations: Any) -> Concurrency:
-    """Regions: each state inside is one. ``barrier`` waits for all, ``preemptive`` ends with the first, a number as soon as so many have succeeded."""
+    """Concurrent regions: each state inside is one. ``barrier`` waits for all, ``preemptive`` ends with the first, a number when that many have succeeded."""
     return Concurrency("concurrently", name, annotations, {"concurrency": kind}, "concurrently")

@@ -32,7 +32,7 @@ _MARKED = re.compile(f"{_MARK}(?:<value_([0-9]+)>)?{_MARK}")
 
 
 class Untraceable(Error):
-    """Python that is no task: it needs a value that is known only while the task runs. Names the line, and what to write instead."""
+    """Python code that cannot be traced as a task: it needs a value that is known only while the task runs. Names the line, and what to write instead."""
 
 
 def user_frame() -> types.FrameType:
@@ -259,10 +259,10 @@ def key_of(name: object, what: str = "a name") -> str:
 
 
 class Value:
-    """A value that is known only while the task runs: an expression. ``+ - * /``, comparisons, ``& | ~``, ``.field`` and ``[i]`` make others.
+    """An expression: a value that is known only while the task runs. ``+ - * /``, comparisons, ``& | ~``, ``.field`` and ``[i]`` make further expressions.
 
-    In an f-string of an annotation it is its text, as it is seen where the annotation stands: ``effects=[f"at({box.id}) = {box.pose}"]``. Elsewhere a text is what it says, and such an f-string is
-    refused: ``fn.concat("Box ", box.id)`` makes a text of values.
+    In an f-string of an annotation it becomes its text, as it is visible at the annotation's place: ``effects=[f"at({box.id}) = {box.pose}"]``.
+    Elsewhere strings are literal, and such an f-string is refused: ``fn.concat("Box ", box.id)`` makes a text of values.
     """
 
     __slots__ = ("_parts", "_is_atom")
@@ -606,7 +606,7 @@ def call(function: str, *arguments: object) -> Value:
 
 
 def expr(text: str) -> Value:
-    """An expression as task files have it: ``ratn.expr("grasp_pose($box)")``. An f-string may name values: ``ratn.expr(f"{box}.id")``."""
+    """An expression in the syntax of task files: ``ratn.expr("grasp_pose($box)")``. An f-string may contain values: ``ratn.expr(f"{box}.id")``."""
     parts = parts_of(text)
     (single,) = parts if len(parts) == 1 else (None,)
     is_atom = single._is_atom if isinstance(single, Value) else isinstance(single, str) and bool(_WORD.match(single.lstrip("$")))
@@ -614,19 +614,19 @@ def expr(text: str) -> Value:
 
 
 def fact(predicate: str, *arguments: object) -> Value:
-    """What the world says at the state's place: ``ratn.fact("at", "cup")`` is the pose; ``"?"`` stands for any argument."""
+    """The value of a fact in the world at the state's place: ``ratn.fact("at", "cup")`` is the pose; ``"?"`` matches any argument."""
     said = ("?" if isinstance(argument, str) and argument == "?" else written(argument) for argument in arguments)
     return Value(*parts_of(predicate), "(", *_joined(said), ")")
 
 
 def exists(what: Value | str) -> Value:
-    """Whether a fact is there, whatever it says, ``ratn.exists(ratn.fact("in_gripper", "cup"))``; or a query with variables, as text."""
+    """Whether a fact exists, whatever its value, ``ratn.exists(ratn.fact("in_gripper", "cup"))``; or a query with variables, as a string."""
     said = (what,) if isinstance(what, Value) else ("(", *parts_of(what), ")")
     return Value("exists ", *said, is_atom=False)
 
 
 def isin(item: object, of: object) -> Value:
-    """``item in of``: an element of a list, or a name in a map."""
+    """``item in of``: whether a list has the element, or a map the key."""
     return Value(within(item), " in ", within(of), is_atom=False)
 
 

@@ -72,17 +72,17 @@ class Provider:
 
 
 def action(name: str, /, inputs: dict[str, Any] | None = None, **annotations: Any) -> AnyState:
-    """A state that performs an action by its name, ``ratn.action("arm/follow", {"trajectory": plan.trajectory}, pia=True)``.
+    """A state that performs an action given by name: ``ratn.action("arm/follow", {"trajectory": plan.trajectory}, pia=True)``.
 
-    Where nobody says its ``resources``, it blocks what performs it: a run, and ``task.check(system=…)``, ask the system for what is in no catalogue. In a task file
-    (``task.to_yaml()``) they have to be said.
+    Without ``resources`` it blocks its provider: a run, and ``task.check(system=…)``, ask the system about actions that are in no catalogue. In a
+    task file (``task.to_yaml()``) such actions need ``resources``.
     """
     state_name = annotations.pop("name", None)
     return perform(name, inputs or {}, annotations, name=state_name)
 
 
 def library(file: str | os.PathLike[str], *, name: str | None = None, **given: Any) -> AnyState:
-    """Another task file as a state; what is no annotation is a parameter: ``ratn.library("fetch_boxes.yaml", boxes=2)``."""
+    """Another task file as a state; keyword arguments that are not annotations are its parameters: ``ratn.library("fetch_boxes.yaml", boxes=2)``."""
     at = user_line()
     trace = Trace.now("`ratn.library`")
     node = trace.add(name, "library", at, assigned_name("library", at) or pathlib.Path(file).stem)
@@ -95,7 +95,7 @@ def library(file: str | os.PathLike[str], *, name: str | None = None, **given: A
 
 
 def leave(outcome: str, *, name: str | None = None) -> State:
-    """A step out of the block around by one of its outcomes."""
+    """Leaves the enclosing block with one of its outcomes."""
     trace = Trace.now("`ratn.leave`")
     node = trace.add(name, "leave", None, f"leave_{literal(outcome, 'an outcome')}")
     node.body.update({"states": [], "transitions": {"success": outcome}})
@@ -112,10 +112,10 @@ def wait(
     name: str | None = None,
     **annotations: Any,
 ) -> AnyState:
-    """Waits for a condition on the world, for a time, or for a signal; nothing is held meanwhile.
+    """Waits for a condition on the world, for a time, or for a signal; no resources are held meanwhile.
 
     ``ratn.wait(ratn.fact("open", "lid"), timeout=60)``, ``ratn.wait(seconds=0.5)``, ``ratn.wait(until=30)`` (seconds since the run began), and
-    ``order = ratn.wait(signal="order")``, of which ``order.value`` is what ``run.signal("order", 2)`` has sent. After ``timeout`` seconds the
+    ``order = ratn.wait(signal="order")``, where ``order.value`` is the value sent by ``run.signal("order", 2)``. After ``timeout`` seconds the
     outcome is ``timeout``.
     """
     given = {"for": condition, "seconds": seconds, "until": until, "signal": signal}
@@ -132,10 +132,10 @@ def wait(
 def ask(
     question: object, choices: Iterable[str], *, default: str | None = None, timeout: float | None = None, name: str | None = None, **annotations: Any
 ) -> AnyState:
-    """Asks an operator, who answers with ``ratn answer`` or ``run.answer("now")``: ``go_on = ratn.ask("May the arm move?", ["now", "never"])``.
+    """Asks the operator, who answers with ``ratn answer`` or ``run.answer("now")``: ``go_on = ratn.ask("May the arm move?", ["now", "never"])``.
 
-    ``go_on.answer`` is the choice. One that ``transitions`` name is an outcome. After ``timeout`` seconds the answer is ``default``, or the outcome
-    ``timeout`` without one.
+    ``go_on.answer`` is the choice. A choice that is a key of ``transitions`` is an outcome. After ``timeout`` seconds the answer is ``default``;
+    without a default the outcome is ``timeout``.
     """
     text = plain(question) if isinstance(question, Value) else literal(str(question), "a question")
     if isinstance(question, Value) and not text.startswith(("'", '"', "$", "concat(")):
@@ -193,7 +193,7 @@ class TaskFunction:
 
 
 def function(function: Callable[..., Any]) -> TaskFunction:
-    """Makes a function one of the task file: written once, used in expressions, ``near(box.pose, table)``. It sees its parameters and facts only."""
+    """Makes a function of the task file: written once, used in expressions, ``near(box.pose, table)``. It can use its parameters and facts only."""
     from ratn._identity import refuse_identity
 
     refuse_identity(function)
@@ -201,7 +201,7 @@ def function(function: Callable[..., Any]) -> TaskFunction:
 
 
 def variable(value: object, *, name: str | None = None) -> Variable:
-    """A scoped variable of the task or block around: ``tries = ratn.variable(0)``. States give it new values with ``assign``."""
+    """A scoped variable of the enclosing task or block: ``tries = ratn.variable(0)``. States change it with ``assign``."""
     at = user_line()
     trace = Trace.now("`ratn.variable`")
     called = name or assigned_name("variable", at)

@@ -38,7 +38,7 @@ def kind_of(provider: str) -> str:
 
 
 class Step:
-    """A function as a state. In a task a call adds the state; elsewhere it calls the function, without a goal if it takes none."""
+    """A function as a state. In a task, a call adds the state; elsewhere it calls the function, without a goal if it takes none."""
 
     def __init__(self, function: Callable[..., Any], name: str | None, said: dict[str, Any]) -> None:
         self.function, self.said = function, said
@@ -89,7 +89,7 @@ class Step:
         return _states.perform(f"{provider}/{self.name}", inputs, {**said, **given}, name=name, kind=kind_of(provider))
 
     def catalogue(self, provider: str) -> str:
-        """What it offers as a step of this provider, as a catalogue has it."""
+        """The catalogue entry of this step for a provider."""
         ports: dict[str, dict[str, str]] = {"inputs": {}, "optional": {}, "outputs": dict(self.action.outputs)}
         for port, kind, is_required, _ in self.action.inputs:
             ports["inputs" if is_required else "optional"][port] = kind
@@ -143,8 +143,8 @@ def step(
 ) -> Step | Callable[[Callable[..., Any]], Step]:
     """Makes a function a step: in a task, its call is a state that a worker of the run performs.
 
-    It is as ``Worker.action``, but for the goal, which it may do without. Its file is run by the worker: what shall happen only in the
-    program that starts the run stands below ``if __name__ == "__main__":``.
+    Parameters are as in ``Worker.action``, but the goal may be omitted. The worker executes the step's file: code for the program that starts the run
+    belongs below ``if __name__ == "__main__":``.
     """
     # The arguments may be iterators, and are needed twice: here, and by the worker.
     outcomes, reads, senses, requires, effects = (list(said) for said in (outcomes, reads, senses, requires, effects))

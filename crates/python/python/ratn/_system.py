@@ -94,7 +94,7 @@ def _due(due: float | str | datetime.timedelta | datetime.datetime) -> str:
 
 @dataclass(frozen=True)
 class Result:
-    """How a run has ended."""
+    """The result of a run."""
 
     outcome: str
     outputs: dict[str, Any] = field(default_factory=dict)
@@ -108,11 +108,11 @@ class Result:
 
 
 class System:
-    """A system that is up: the one of ``runtime_dir``, or one that is started for as long as this is open.
+    """A running system: the one of ``runtime_dir``, or one that is started for as long as this object is open.
 
-    Unless ``runtime_dir`` (or ``RATN_RUNTIME_DIR``) names one that runs, ``ratn up`` starts one, with ``config`` and in a folder of its
-    own, and ``close()`` (or the end of the ``with`` block) ends it. ``options`` are further options of ``ratn up``: ``boxes=2``,
-    ``planners=2``, ``seed=7``, ``speed=10``.
+    Unless ``runtime_dir`` (or ``RATN_RUNTIME_DIR``) names a running system, ``ratn up`` starts one, with ``config`` and in its own folder, and
+    ``close()`` (or the end of the ``with`` block) ends it. ``options`` are further options of ``ratn up``: ``boxes=2``, ``planners=2``, ``seed=7``,
+    ``speed=10``.
     """
 
     def __init__(
@@ -175,7 +175,7 @@ class System:
         return f"<System at {self.runtime_dir}{'' if self._process is None else ', started here'}>"
 
     def close(self) -> None:
-        """Gives back what is held, and ends the system if it was started here. A fork of the process that opened it ends nothing."""
+        """Releases what is held, and ends the system if it was started here. In a fork of the process that opened it, it ends nothing."""
         try:
             self._client.close()
         finally:
@@ -213,9 +213,15 @@ class System:
         parameters: Mapping[str, Any] | None = None,
         **others: Any,
     ) -> Run:
-        """Begins a run of a task, or of a task file; its parameters are keyword arguments, or are in ``parameters``, where one is called as something here (``parameters={"due": 3}``). ``mode`` is ``cdtn`` or ``hsm``.
+        """Begins a run of a task, or of a task file. Its parameters are keyword arguments; parameters named like an option of this method go into
+        ``parameters`` (``parameters={"due": 3}``). ``mode`` is ``cdtn`` or ``hsm``.
 
-        It goes beside other runs of the system, unless it or one of them is to be ``alone``; ``urgency`` (``low``, ``normal``, ``high``) says whose needs come first. ``share`` (0.01 to 100) is how much it has of what several runs need, beside the shares of the others. ``due`` says when it is to have ended: seconds from its start or a ``timedelta``, a ``datetime`` (local time where it names no zone), or a text as ``ratn run --due`` has it (``"15m"``); of what several runs need at about the same time, the run that is due first comes first. The steps of a task (``@ratn.step``) are performed by workers that are the run's own and live as long as it: ``step_workers`` processes for each file. The run's log is in a temporary folder unless ``log`` says where; that goes with the ``Run``, unless the run is under way then.
+        It runs beside other runs of the system, unless it or one of them is ``alone``. ``urgency`` (``low``, ``normal``, ``high``) says whose needs
+        come first. ``share`` (0.01 to 100) is its weight, relative to the other runs, for resources that several runs need. ``due`` is when it should
+        have ended: seconds from its start or a ``timedelta``, a ``datetime`` (local time if it has no zone), or a text as for ``ratn run --due``
+        (``"15m"``); if several runs need a resource at about the same time, the run that is due first comes first. The steps of a task
+        (``@ratn.step``) are performed by the run's own workers, which end with it: ``step_workers`` processes for each file. The log is written to
+        ``log``, or else to a temporary folder, which is removed with the ``Run`` object unless the run is still under way.
         """
         self._client.check_open()
         given = {**(parameters or {}), **others}
@@ -226,18 +232,18 @@ class System:
     def acquire(
         self, *kinds: str, priority: int = 0, timeout_s: float | None = None, holder: str = "python"
     ) -> Lease:
-        """Waits until one resource of each kind is free and takes all of them: ``with system.acquire("PathPlanner") as lease:``.
+        """Waits until one resource of each kind is free and acquires all of them: ``with system.acquire("PathPlanner") as lease:``.
 
-        Raises ``ratn.DeadlineExceeded`` after ``timeout_s`` seconds of wall time; ``None`` and infinity are for ever.
+        Raises ``ratn.DeadlineExceeded`` after ``timeout_s`` seconds of wall time; ``None`` and infinity wait without limit.
         """
         return self._client.acquire(list(kinds), priority=priority, timeout_s=timeout_s, holder=holder)
 
     def resources(self, *kinds: str) -> list[dict[str, Any]]:
-        """The resources, of these kinds where any is given."""
+        """The resources; only those of the given kinds, if any are given."""
         return self._client.resources(*kinds)
 
     def pools(self) -> list[dict[str, Any]]:
-        """The pools of worker processes of all hosts, as ``ratn ps --json`` has them."""
+        """The pools of worker processes on all hosts, as printed by ``ratn ps --json``."""
         self._client.check_open()
         told = _told(["ps", "--json", "--runtime-dir", str(self.runtime_dir)])
         if not told.stdout.strip():
@@ -246,22 +252,22 @@ class System:
         return [{"host": host["host"], **pool} for host in said["hosts"] for pool in host.get("pools", [])]
 
     def query(self, *patterns: str) -> list[Fact]:
-        """The facts of the world that match any of the patterns (``"at(?)"``); all of them without one."""
+        """The facts of the world that match any of the patterns (``"at(?)"``); all facts if no pattern is given."""
         return self._client.query(*patterns)
 
     def set(self, fact: str, value: Any) -> int:
-        """Writes a fact, ``system.set("at(box_1)", ratn.Pose(1, 0, 0.7))``; ``None`` deletes it. Gives the world's revision."""
+        """Writes a fact, ``system.set("at(box_1)", ratn.Pose(1, 0, 0.7))``; ``None`` deletes it. Returns the world's revision."""
         return self._client.set(fact, value)
 
     def project(self, changes: Mapping[str, Any], *, timeout_s: float | None = None) -> Projected:
-        """A world that might be: ``with system.project({"at(box_1)": ratn.Pose(1, 0, 0.7)}) as world: world.query("at(?)")``.
+        """Creates a projection (a hypothetical world): ``with system.project({"at(box_1)": ratn.Pose(1, 0, 0.7)}) as world: world.query("at(?)")``.
 
-        The world as it is now with changes (``None`` deletes), of which nobody else sees anything. It holds room for itself, for which it waits.
+        It is the present world with changes (``None`` deletes) that nobody else sees. It holds a ``WorldModel`` resource, for which it waits.
         """
         return self._client.project(list(changes.items()), timeout_s=timeout_s)
 
     def watch(self, *patterns: str) -> WorldWatch:
-        """Iterates over what holds now and each change after it."""
+        """Iterates over the present facts, then over each change."""
         return self._client.watch(*patterns)
 
 
@@ -292,7 +298,7 @@ class _Child(subprocess.Popen[Any]):
 
 
 class Run:
-    """A run under way. Iterating over it (``for`` or ``async for``) gives the events of its log as dicts, until it has ended."""
+    """A run under way. Iterating over it (``for`` or ``async for``) yields the events of its log as dicts, until it has ended."""
 
     def __init__(
         self,
@@ -453,11 +459,11 @@ class Run:
 
     @property
     def under_way(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the run has not ended."""
         return self._process.poll() is None
 
     def messages(self) -> str:
-        """What the run has told people so far."""
+        """The run's messages for people so far."""
         return _text_of(self._told)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
@@ -492,7 +498,9 @@ class Run:
             yield []
 
     def result(self, timeout_s: float | None = None) -> Result:
-        """Waits for the end; for ``timeout_s`` seconds (``TimeoutError``) where that is neither ``None`` nor infinite. A run that ends badly is no exception: its outcome says so. One that cannot begin is a ``ratn.Error``."""
+        """Waits for the end of the run; at most ``timeout_s`` seconds (then ``TimeoutError``), unless that is ``None`` or infinite. A failed run raises
+        no exception: its outcome says so. A run that cannot begin raises a ``ratn.Error``.
+        """
         try:
             self._process.wait(_ratn.patience_s("timeout_s", timeout_s))
         except subprocess.TimeoutExpired:
@@ -507,7 +515,7 @@ class Run:
 
     @property
     def id(self) -> str:
-        """Its id, which tells it from other runs of the system."""
+        """The id of the run, unique in the system."""
         self._wait_for_log()
         with self.log.open("rb") as log:
             return str(json.loads(log.readline())["origin"]["run"])
@@ -524,30 +532,32 @@ class Run:
         return told.stdout.strip()
 
     def signal(self, name: str, value: Any = None) -> None:
-        """Sends a signal, which a state of the task waits for (``ratn.wait(signal="order")``), with a value. It is kept until one does."""
+        """Sends a signal with a value, for which a state of the task waits (``ratn.wait(signal="order")``). It is kept until a state takes it."""
         said = [] if value is None else [expression(value)]
         if any("\0" in text for text in said):
             raise ValueError("a text with NUL in it cannot be sent")
         self._tell(["signal", self.id, name, *said])
 
     def answer(self, choice: str, *, state: str | None = None) -> None:
-        """Answers the question of a state (``ratn.ask``); where several ask, of that of this path."""
+        """Answers the question of a state (``ratn.ask``); if several states ask, ``state`` is the path of one."""
         self._tell(["answer", self.id, choice, *(["--state", state] if state is not None else [])])
 
     def pause(self) -> str:
-        """No further state begins that acts for real; what runs goes on."""
+        """Pauses: no further state that acts begins; states under way go on."""
         return self._control("pause")
 
     def step(self) -> str:
-        """One such state begins, then the run pauses again."""
+        """Lets one state that acts begin, then the run pauses again."""
         return self._control("step")
 
     def break_at(self, state: str) -> str:
-        """The run pauses before a state that acts, at this path or inside of it, begins (``for_box/grasp``); :meth:`resume` and :meth:`step` let it go on."""
+        """Sets a breakpoint: the run pauses before a state that acts begins, at this path or inside of it (``for_box/grasp``); :meth:`resume` and
+        :meth:`step` continue.
+        """
         return self._control("break", state)
 
     def clear(self, state: str | None = None) -> str:
-        """Takes the breakpoint at a state away, or all."""
+        """Removes the breakpoint at a state, or all."""
         return self._control("clear", *([] if state is None else [state]))
 
     def resume(self) -> str:
@@ -555,7 +565,7 @@ class Run:
         return self._control("resume")
 
     def abort(self) -> str:
-        """Ends the run: motions stop, everything is given back."""
+        """Ends the run: motions stop, all resources are released."""
         return self._control("abort")
 
     def _wait_for_log(self) -> None:
@@ -573,23 +583,23 @@ class Run:
         return _views.Log(self.log)
 
     def report(self) -> _views.Report:
-        """What ``ratn report --json`` tells of the log so far, as a dict that shows itself as the table for people."""
+        """The output of ``ratn report --json`` for the log so far, as a dict that is shown as the table for people."""
         return self._read().report()
 
     def nodes(self) -> _views.Nodes:
-        """A record of each attempt to perform a node, in the order in which they began: see :meth:`Log.nodes`."""
+        """One record per attempt to perform a node, in the order in which they began: see :meth:`Log.nodes`."""
         return self._read().nodes()
 
     def why(self, name: str) -> _views.Why:
-        """What waited for what, of each visit of the state of this path or name: ``print(run.why("move_2"))``."""
+        """What the visits of a state waited for, given by its path or name: ``print(run.why("move_2"))``."""
         return self._read().why(name)
 
     def critical_path(self) -> _views.CriticalPath:
-        """What the run waited for, from its start to its end. Empty where it has not ended."""
+        """The critical path: what the run waited for, from its start to its end. Empty if the run has not ended."""
         return self._read().critical_path()
 
     def gantt(self, by: str = "resource") -> _views.Chart:
-        """The Gantt chart so far, as SVG; a row is a ``resource`` or a ``node``."""
+        """The Gantt chart so far, as SVG; one row per ``resource`` or per ``node``."""
         return self._read().gantt(by)
 
     def network(self) -> _views.Network:

@@ -31,7 +31,7 @@ from ratn._yaml import Body
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is wrong with a task, with the line of the file that says it."""
+    """A problem of a task, with the line of the file that causes it."""
 
     rule: str
     severity: str
@@ -48,7 +48,7 @@ class Finding:
 
 
 class Task:
-    """A task: the tree of a task file, traced of a Python function or read from YAML."""
+    """A task: the tree of a task file, traced from a Python function or read from YAML."""
 
     def __init__(
         self,
@@ -70,12 +70,12 @@ class Task:
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """The name of the task."""
         return str(self.document.get("task", ""))
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Its parameters, as a task file has them."""
+        """The parameters, in the form of a task file."""
         return dict(self.document.get("parameters") or {})
 
     def __repr__(self) -> str:
@@ -94,7 +94,7 @@ class Task:
 
     @staticmethod
     def from_yaml(source: str | os.PathLike[str]) -> Task:
-        """Reads a task file, or the text of one (which has a line end)."""
+        """Reads a task file, or the text of a task file (a string with a line break)."""
         if isinstance(source, str) and "\n" in source:
             text, file, folder = source, "<text>", pathlib.Path.cwd()
         else:
@@ -106,10 +106,9 @@ class Task:
         return Task(document, folder=folder, file=file, source=text)
 
     def to_yaml(self, path: str | os.PathLike[str] | None = None) -> str:
-        """The text of a task file with the same meaning, which is written to ``path``, too, where that is given.
+        """The text of an equivalent task file; also written to ``path``, if given.
 
-        Comments, and what is written between lines, are not kept. Paths in it stay relative to ``folder``, or to that of the file
-        that was read.
+        Comments and formatting are not kept. Paths in it stay relative to ``folder``, or to the folder of the file that was read.
         """
         text = "\n".join(_yaml.write(self.document).text) + "\n"
         if path is not None:
@@ -117,7 +116,7 @@ class Task:
         return text
 
     def to_python(self) -> str:
-        """Python of which the same task can be traced: to go on with a task file in Python."""
+        """Python code from which the same task can be traced, to continue a task file in Python."""
         return _source.python_of(self.document)
 
     def _lines(self) -> _yaml.Lines:
@@ -129,7 +128,7 @@ class Task:
         return _yaml.write(self.document)
 
     def standing_alone(self) -> str:
-        """The text with paths that are valid everywhere."""
+        """The text of the task file with absolute paths."""
         return "\n".join(self._standing_alone().text) + "\n"
 
     def _step_files(self) -> dict[str, str]:
@@ -204,10 +203,11 @@ class Task:
         return Finding(said["rule"], said["severity"], file, line, said["path"], said["message"], said["help"])
 
     def check(self, *, system: object = None, config: str | os.PathLike[str] | None = None) -> list[Finding]:
-        """What ``ratn check`` notices, with the lines of the Python file; a task that is refused raises ``ratn.InvalidTask``.
+        """The findings of ``ratn check``, with lines of the Python file; an invalid task raises ``ratn.InvalidTask``.
 
-        It is checked against the built-in catalogue, those of the modules of actions that it uses, and its own steps; with a ``system`` (a
-        ``ratn.System``, or a runtime directory) against what that offers and its workers say of themselves, with a ``config`` against that.
+        It is checked against the built-in catalogue, the catalogues of the action modules that it uses, and its own steps; with a ``system`` (a
+        ``ratn.System``, or a runtime directory) against the catalogue of that system and the descriptions of its workers; with a ``config`` against
+        the catalogue of the config.
         """
         if system is not None or config is not None:
             return self._check_with(system, config)
@@ -245,7 +245,7 @@ class Task:
         return findings
 
     def model(self) -> dict[str, Any]:
-        """The model that every part of the system works with, as dicts and lists; two tasks are the same where these are equal."""
+        """The model used by all parts of the system, as dicts and lists; two tasks are equivalent if their models are equal."""
         findings, model = self._read()
         if model is None:
             raise invalid(findings)
@@ -306,11 +306,11 @@ def task(
     name: str | None = None,
     **said: Any,
 ) -> Task | Callable[[Callable[..., Any]], Task]:
-    """Makes a function a task: it is called once, now, and what it does is what the task does.
+    """Makes a function a task: it is called once, immediately, and its calls become the task's states.
 
-    Its parameters are the task's, typed by their annotations (a default makes one optional); the dict that it returns is the task's outputs; the
-    first paragraph of its docstring is the description. Keyword arguments are keys of a task file: ``horizon``, ``speculation_width``,
-    ``deadline``, ``exceptions``, ``ontology``, ``tolerance``, ``world``, ``outcomes``, ``variables``, ``functions``, ``description``.
+    Its parameters are the task's, typed by their annotations (a default makes a parameter optional); the returned dict has the task's outputs; the
+    first paragraph of its docstring is the description. Keyword arguments are keys of a task file: ``horizon``, ``speculation_width``, ``deadline``,
+    ``exceptions``, ``ontology``, ``tolerance``, ``world``, ``outcomes``, ``variables``, ``functions``, ``description``.
     """
     if function is None:
         return lambda function: _traced(function, name, said)
@@ -412,7 +412,7 @@ def _returned(function: Callable[..., Any], returned: object, hint: Any) -> dict
 
 @dataclass(frozen=True)
 class Doc:
-    """What a parameter is, for people: ``boxes: Annotated[int, ratn.Doc("how many")] = 3``."""
+    """The description of a parameter for people: ``boxes: Annotated[int, ratn.Doc("how many")] = 3``."""
 
     text: str
 

@@ -392,7 +392,7 @@ def _ports(value: object) -> list[Port]:
 
 
 class State:
-    """A state of a task. Its outputs are its attributes, ``look.boxes``; in ``transitions`` it stands for itself."""
+    """A state of a task. Its outputs are its attributes, ``look.boxes``; in ``transitions`` it can be used as a target."""
 
     __slots__ = ("_node",)
     _is_state = True

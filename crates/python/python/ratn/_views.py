@@ -42,13 +42,13 @@ class Records(list[dict[str, Any]]):
 
 
 class Nodes(Records):
-    """A record of each attempt to perform a node."""
+    """One record per attempt to perform a node."""
 
     _shown = ["path", "action", "attempt", "began_s", "ended_s", "outcome", "activity", "resources", "ahead_of_time"]
 
 
 class CriticalPath(Records):
-    """What a run waited for, from its start to its end: a record of each link."""
+    """The critical path of a run, from its start to its end: one record per link."""
 
     _shown = ["path", "stage", "from_s", "to_s", "waited_for"]
 
@@ -57,7 +57,7 @@ class CriticalPath(Records):
 
 
 class Why(Records):
-    """What the visits of a state waited for, and for how long: a record of each visit, which says it in sentences as a text."""
+    """What the visits of a state waited for, and for how long: one record per visit, which explains it in sentences when printed."""
 
     def __str__(self) -> str:
         return "\n".join(line for visit in self for line in _sentences(visit))
@@ -89,7 +89,7 @@ def _sentences(visit: dict[str, Any]) -> list[str]:
 
 
 class Chart:
-    """A chart, which a notebook shows."""
+    """A chart that notebooks display."""
 
     def __init__(self, svg: str) -> None:
         #: The picture, as SVG.
@@ -102,12 +102,12 @@ class Chart:
         return self.svg
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes it into a file, ``run.svg``."""
+        """Writes the chart to a file, ``run.svg``."""
         pathlib.Path(path).write_text(self.svg, encoding="utf-8")
 
 
 class Network:
-    """The dataflow network of a run, as a graph for Mermaid, which a notebook shows."""
+    """The dataflow network of a run, as a Mermaid graph that notebooks display."""
 
     def __init__(self, mermaid: str) -> None:
         #: The graph, in Mermaid's language.
@@ -121,7 +121,7 @@ class Network:
 
 
 class Report(dict[str, Any]):
-    """What ``ratn report`` tells, as a dict; as a text it is the table for people."""
+    """The output of ``ratn report``, as a dict; its text is the table for people."""
 
     def __init__(self, log: _ratn.Log) -> None:
         super().__init__(json.loads(log.report()))
@@ -135,25 +135,25 @@ class Report(dict[str, Any]):
 
 
 class Log:
-    """An event log: of a run under way, or of one that has ended, also on another machine. ``ratn.Log("run.jsonl").gantt()``."""
+    """An event log of a run, under way or ended, also from another machine. ``ratn.Log("run.jsonl").gantt()``."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._log = _ratn.Log(path)
 
     def nodes(self) -> Nodes:
-        """A record of each attempt to perform a node, in the order in which they began.
+        """One record per attempt to perform a node, in the order in which they began.
 
-        ``path`` (``for_box[0]/move``), ``provider``, ``action``, ``attempt``, ``began_s`` and ``ended_s`` (the robot's seconds since the run began),
-        ``outcome`` and ``reason``; ``activity`` (``motion detection planning other``), ``resources``, whether it was ``speculative`` and begun
-        ``ahead_of_time``, and what became of its ``result`` (``used lost open``). What is under way has ``None`` as its end and outcome; what was given up
-        has the outcome ``cancelled``, whose worker died ``crashed``.
+        ``path`` (``for_box[0]/move``), ``provider``, ``action``, ``attempt``, ``began_s`` and ``ended_s`` (seconds of the robot's time since the run
+        began), ``outcome`` and ``reason``; ``activity`` (``motion detection planning other``), ``resources``, whether it was ``speculative`` and
+        begun ``ahead_of_time``, and what happened to its ``result`` (``used lost open``). Attempts under way have ``None`` as end and outcome; the
+        outcome is ``cancelled`` if the attempt was given up, and ``crashed`` if its worker died.
         """
         return Nodes(json.loads(self._log.nodes()))
 
     def why(self, name: str) -> Why:
-        """What waited for what: of each visit of the state of this path or name, its stages, what ended each, and who held what it asked for.
+        """What the visits of a state waited for, given by its path or name: the stages of each, what ended each stage, and who held the requested resources.
 
-        Raises ``ratn.NotFound`` where the run has no such state.
+        Raises ``ratn.NotFound`` if the run has no such state.
         """
         visits = json.loads(self._log.why(name))
         if not visits:
@@ -162,15 +162,15 @@ class Log:
         return Why(visits)
 
     def critical_path(self) -> CriticalPath:
-        """What the run waited for, from its start to its end. Empty where it has not ended."""
+        """The critical path: what the run waited for, from its start to its end. Empty if the run has not ended."""
         return CriticalPath(json.loads(self._log.critical_path()))
 
     def gantt(self, by: str = "resource") -> Chart:
-        """The Gantt chart, as SVG; a row is a ``resource`` or a ``node``."""
+        """The Gantt chart, as SVG; one row per ``resource`` or per ``node``."""
         return Chart(self._log.gantt(by))
 
     def report(self) -> Report:
-        """Where the time went: what ``ratn report --json`` tells, as a dict that shows itself as the table."""
+        """Where the time went: the output of ``ratn report --json``, as a dict that is shown as the table."""
         return Report(self._log)
 
     def _repr_html_(self) -> str:

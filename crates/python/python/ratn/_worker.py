@@ -22,7 +22,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 @dataclass
 class Outcome:
-    """How a goal ends that ends otherwise than with success: one of the action's ``outcomes``."""
+    """The result of a goal that does not end with success: one of the action's ``outcomes``."""
 
     name: str
     outputs: dict[str, Any] = field(default_factory=dict)
@@ -30,10 +30,10 @@ class Outcome:
 
 
 class Worker:
-    """A worker that takes one goal at a time. As many processes of it run in parallel as its template says.
+    """A worker, which performs one goal at a time. The template sets how many processes of it run in parallel.
 
-    ``provider`` is what tasks call it (``inspector`` of ``inspector/nearest``): the name of its file unless given. ``kind`` is the
-    kind of resource that it is: what the template says (``--kind``), or ``Inspector`` of ``inspector``.
+    ``provider`` is its name in tasks (``inspector`` in ``inspector/nearest``); default: the name of its file. ``kind`` is the kind of its resource;
+    default: the one of the template (``--kind``), or ``Inspector`` for ``inspector``.
     """
 
     def __init__(self, provider: str | None = None, *, kind: str | None = None) -> None:
@@ -79,13 +79,13 @@ class Worker:
     ) -> Any:
         """Makes a function (also an ``async def``) an action. Its first parameter is the goal, the others are the input ports.
 
-        It returns its outputs as a ``dict``, or an ``Outcome``. ``computes`` is true where it says that it changes nothing (``effects=[]``) and senses nothing: one that says nothing may move something. What else is said of it
-        holds for every state that says nothing itself, in the words of task files (``$start`` is the state's input): the facts that it ``reads`` and its
-        ``effects`` (``[]``: none; left out: unknown, so any), what it ``senses`` and ``requires``, which kinds of resources it ``blocks`` beside its own, and
-        how many seconds it usually ``takes``. One that
-        ``suspends`` stands still while its goal is suspended, because the resource manager is not heard (``goal.while_held()`` between its steps);
-        the others end then. An ``anytime`` action computes or senses, and gives results before it returns (``goal.improved``) where its goal may
-        (``goal.improves``): any of them will do.
+        It returns its outputs as a ``dict``, or an ``Outcome``. ``computes`` means that it neither acts nor senses; default: true if it declares no
+        effects (``effects=[]``) and senses nothing. An action without any declaration may move something. The other arguments are the default
+        annotations of its states, in the syntax of task files (``$start`` is the state's input): the facts that it ``reads``, its ``effects``
+        (``[]``: none; omitted: unknown, so any), what it ``senses`` and ``requires``, the kinds of resources that it ``blocks`` besides its own, and
+        how many seconds it usually ``takes``. An action that ``suspends`` stands still while its goal is suspended because the resource manager
+        cannot be reached (``goal.while_held()`` between its steps); the others end then. An ``anytime`` action computes or senses, and gives
+        intermediate results (``goal.improved``) if its goal allows this (``goal.improves``); each of them is good enough.
         """
 
         def known(function: _Function) -> _Function:
@@ -125,8 +125,8 @@ class Worker:
     def run(self, arguments: list[str] | None = None, *, without_leases: bool = False) -> None:
         """Serves goals until the process is told to end, by a signal or by the end of its standard input.
 
-        ``arguments`` are those that a template passes: the process's own unless given. What is logged with ``logging`` is in the
-        worker's log (``ratn logs``). Without leases whoever may call it has it perform goals: for trying it out.
+        ``arguments`` are those that a template passes; default: those of the process. Output of ``logging`` goes to the worker's log (``ratn logs``).
+        With ``without_leases`` every caller may have goals performed: for trying it out.
         """
         self._serve(arguments, without_leases, None)
 
@@ -152,10 +152,10 @@ class Driven:
 class Driver(Worker):
     """A worker that moves something: with emergency stop, hold and standstill.
 
-    ``brakes`` says how it comes to rest, and lets go again. ``standstill_s`` is the time within which everything stands still after a lease has ended: the
-    next one is granted when the driver has confirmed that, or after it; a template needs a ``standstill_ms`` of at least that. A
-    ``stop_file`` keeps an emergency stop beyond the end of the process; it belongs into a state directory. Without one a process that takes the place of one
-    that ended during a stop knows nothing of that stop, and has its brakes let go.
+    ``brakes`` registers the function that stops and releases it. ``standstill_s`` is the time within which everything stands still after a lease has
+    ended: the next lease is granted when the driver has confirmed standstill, or after this time; its template needs a ``standstill_ms`` of at least
+    that. A ``stop_file`` keeps an emergency stop beyond the end of the process; it belongs in a state directory. Without it, a process that replaces
+    one that ended during a stop does not know of that stop, and releases the brakes.
     """
 
     def __init__(
@@ -171,14 +171,15 @@ class Driver(Worker):
         self._brakes: Callable[[str, str], object] | None = None
 
     def brakes(self, function: Callable[[str, str], object]) -> Callable[[str, str], object]:
-        """Makes a function the brakes: ``@d.brakes`` above ``def brake(state, reason): …``.
+        """Registers the function for the brakes: ``@d.brakes`` above ``def brake(state, reason): …``.
 
-        It is called with ``"held"``, ``"stopped"`` or ``"ready"`` and with whoever asked for it and why, from another thread than the goals.
-        For the first two it returns when nothing moves; where it raises, the stop is in force and not confirmed. At the start it is called for
-        ``"held"`` and then for ``"ready"``, because the process before may have begun a motion; where a stop is kept, for ``"stopped"``, and for ``"ready"`` only
-        when the stop is cleared. No goal begins before it has returned, and in a pool all of that is within the template's ``start_timeout_s``. It may be called for
-        a state that it has carried out already. An emergency stop does not wait for an earlier call to return, and may find a device that is still used by that;
-        it is confirmed when the earlier one has returned and the brakes have been told once more, whatever they raised before, so that the newest state counts.
+        It is called with ``"held"``, ``"stopped"`` or ``"ready"`` and with who requested it and why, from another thread than the goals. For the
+        first two it returns when nothing moves; if it raises, the stop is in force and not confirmed. At the start it is called with ``"held"`` and
+        then with ``"ready"``, because an earlier process may have begun a motion; if a stop is kept, with ``"stopped"``, and with ``"ready"`` only
+        when the stop is cleared. No goal begins before it has returned; in a pool, all of that has to fit into the template's ``start_timeout_s``. It
+        may be called again for a state that it has already carried out. An emergency stop does not wait for an earlier call to return, so it may find
+        a device that the earlier call still uses; the stop is confirmed when the earlier call has returned and the brakes have been called once more,
+        whatever they raised before, so that the newest state counts.
         """
         if any(kind(function) for kind in (inspect.iscoroutinefunction, inspect.isgeneratorfunction, inspect.isasyncgenfunction)):
             raise TypeError(f"{_ports.where(function)}: the brakes are a plain function, without `async` and `yield`: nothing moves when it has returned")
@@ -186,7 +187,7 @@ class Driver(Worker):
         return function
 
     def run(self, arguments: list[str] | None = None, *, without_leases: bool = False) -> None:
-        """Serves goals until the process is told to end. A driver asks for leases always."""
+        """Serves goals until the process is told to end. A driver always requires leases."""
         if without_leases:
             raise ValueError("a driver moves something: it performs goals only for whoever holds it")
         if self._brakes is None:

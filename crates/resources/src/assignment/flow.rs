@@ -1,37 +1,37 @@
-//! A maximum flow from classes of requirements to nodes of resources (Dinic, "Algorithm for solution of a problem of maximum flow in
-//! networks with power estimation", 1970), from what they have already.
+//! Computes a maximum flow from classes of requirements to nodes of resources (Dinic, "Algorithm for solution of a problem of maximum flow in
+//! networks with power estimation", 1970), starting from an existing assignment.
 //!
 //! ```text
-//!   class ──(lacks)──▶ node of a signature: all resources that the same classes fit
+//!   class ──(lacks)──▶ node of a signature: all resources that fit the same classes
 //!                        └─ exhausted by another class ──▶ that class takes from another node of its own instead
 //! ```
-//! Levels are those of classes, so a path is no longer than there are classes, and a phase looks at each pair of class and node once.
-//! For classes of one grain the flow is maximum. Where whole units and parts of them are taken of the same resources, whether
-//! there is a better one is as hard as finding a largest independent set; then what is found is what such paths find.
+//! Levels are levels of classes, so a path is at most as long as the number of classes, and a phase visits each pair of class and node once. For
+//! classes of one grain the flow is maximum. If whole units and fractions are taken from the same resources, finding a better flow is as hard as
+//! finding a largest independent set; the result is then what such paths find.
 
 use crate::id::Slot;
 use ratn_model::resource::Quantity;
 use std::collections::BTreeMap;
 
-/// One of the signatures of resources.
+/// The id of a signature of resources.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct NodeId(u32);
 
-/// The signature of what no class fits.
+/// The signature of resources that fit no class.
 const NOTHING: NodeId = NodeId(0);
 
-/// All resources that the same classes fit.
+/// All resources that fit the same classes.
 #[derive(Debug)]
 struct Node {
-    /// The class that fits it, and the node of the others that do.
+    /// The last class that they fit, and the node of the signature without that class.
     signature: (usize, NodeId),
     members: Vec<(Slot, Quantity)>,
-    /// What there is in whole units of single resources, and in all.
+    /// The amount available in whole units of single resources, and in total.
     whole: Quantity,
     all: Quantity,
-    /// By class, what it takes of it.
+    /// For each class, the amount that it takes of this node.
     shares: Vec<(usize, Quantity)>,
-    /// What is taken in whole units, and what in parts.
+    /// The amounts taken in whole units, and in fractions.
     taken_whole: Quantity,
     taken_parts: Quantity,
     changed: bool,
@@ -43,7 +43,7 @@ struct Source {
     grain: Quantity,
     nodes: Vec<NodeId>,
     lacks: Quantity,
-    /// In this phase: how far from one that lacks something, and the node to look at next.
+    /// In this phase: the distance to a class that lacks something, and the next node to visit.
     level: Option<usize>,
     next: usize,
 }
@@ -53,15 +53,15 @@ struct Source {
 pub(super) struct Flow {
     sources: Vec<Source>,
     nodes: Vec<Node>,
-    /// By slot, its node and what is available of it.
+    /// For each slot, its node and the available amount.
     of_slot: Vec<(NodeId, Quantity)>,
     slots: Vec<Slot>,
-    /// The signature with one more class, of one without.
+    /// Maps a signature and one more class to the resulting signature.
     with: BTreeMap<(NodeId, usize), NodeId>,
 }
 
 impl Flow {
-    /// Of classes with these grains.
+    /// A flow for classes with these grains.
     pub(super) fn new(grains: Vec<Quantity>) -> Flow {
         let source = |grain| Source { grain, nodes: Vec::new(), lacks: Quantity::ZERO, level: None, next: 0 };
         let sources = grains.into_iter().map(source).collect();
@@ -69,7 +69,7 @@ impl Flow {
         Flow { sources, nodes: vec![Node::of((0, NOTHING))], of_slot, slots, with }
     }
 
-    /// A class can use a resource. Classes come one after the other.
+    /// A class can use a resource. To be called in the order of classes.
     pub(super) fn fits(&mut self, class: usize, slot: Slot, available: Quantity) {
         if available.is_zero() {
             return;
@@ -93,7 +93,7 @@ impl Flow {
         self.of_slot[slot.index()] = (node, available);
     }
 
-    /// Every class has said what it can use.
+    /// Completes the nodes, when every class has said what it can use.
     pub(super) fn seal(&mut self) {
         for slot in &self.slots {
             let (id, available) = self.of_slot[slot.index()];
@@ -116,19 +116,19 @@ impl Flow {
         }
     }
 
-    /// A class has so much of a resource already.
+    /// A class has this amount of a resource already.
     pub(super) fn has(&mut self, class: usize, slot: Slot, amount: Quantity) {
         if let Some((node, _)) = self.of_slot.get(slot.index()).copied() {
             self.take(class, node, amount);
         }
     }
 
-    /// A class lacks so much more.
+    /// A class lacks this amount more.
     pub(super) fn wants(&mut self, class: usize, amount: Quantity) {
         self.sources[class].lacks += amount;
     }
 
-    /// Takes as much more as there is, moving what others took. Whether anything was moved.
+    /// Takes as much as possible, moving what others took. Returns whether anything was moved.
     pub(super) fn improve(&mut self) -> bool {
         let mut moved = false;
         while self.levels() {
@@ -155,7 +155,7 @@ impl Flow {
         self.sources[class].grain
     }
 
-    /// Nodes of which other amounts are taken than at first.
+    /// Nodes whose taken amounts have changed.
     pub(super) fn changed(&self) -> impl Iterator<Item = NodeId> {
         (0_u32..).zip(&self.nodes).filter(|(_, node)| node.changed).map(|(index, _)| NodeId(index))
     }
@@ -164,19 +164,19 @@ impl Flow {
         self.of_slot.get(slot.index()).is_some_and(|(node, _)| self.nodes[node.index()].changed)
     }
 
-    /// The resources of a node, with what is available of each.
+    /// The resources of a node, with the available amount of each.
     pub(super) fn members(&self, node: NodeId) -> &[(Slot, Quantity)] {
         &self.nodes[node.index()].members
     }
 
-    /// What each class takes of a node: whole units first, so that parts do not break them.
+    /// The amount that each class takes of a node, whole units first, so that fractions do not break them.
     pub(super) fn shares(&self, node: NodeId) -> Vec<(usize, Quantity)> {
         let mut shares = self.nodes[node.index()].shares.clone();
         shares.sort_by_key(|(class, _)| (std::cmp::Reverse(self.grain(*class)), *class));
         shares
     }
 
-    /// How far each class is from one that lacks something, by nodes that they share; whether anything is left within reach.
+    /// Computes the distance of each class to one that lacks something, over shared nodes; returns whether anything is left within reach.
     fn levels(&mut self) -> bool {
         let mut level: Vec<usize> = Vec::new();
         for (class, source) in self.sources.iter_mut().enumerate() {
@@ -212,7 +212,7 @@ impl Flow {
         false
     }
 
-    /// Up to `wanted` more for a class, from other nodes than `but`; returns how much it took.
+    /// Takes up to `wanted` more for a class, from other nodes than `but`; returns the amount.
     fn push(&mut self, class: usize, wanted: Quantity, but: NodeId) -> Quantity {
         let beyond = self.sources[class].level.map(|level| level + 1);
         while let Some(node) = self.sources[class].nodes.get(self.sources[class].next).copied() {
@@ -246,13 +246,13 @@ impl Flow {
         Quantity::ZERO
     }
 
-    /// How much another class has to leave of a node for this one to have `wanted` more.
+    /// How much another class has to give up of a node so that this one can take `wanted` more.
     fn to_move(&self, class: usize, other: usize, node: NodeId, wanted: Quantity) -> Quantity {
         let Node { whole, all, taken_whole, taken_parts, .. } = &self.nodes[node.index()];
         let there = all.saturating_sub(*taken_whole + *taken_parts).min(wanted);
         match (self.grain(class) == Quantity::ONE, self.grain(other) == Quantity::ONE) {
             (true, false) => {
-                // Parts stand in its way only where there are whole units beside them.
+                // Fractions are in its way only as far as whole units are left.
                 let wanted = whole.saturating_sub(*taken_whole).min(wanted);
                 wanted.saturating_sub(there)
             }
@@ -261,7 +261,7 @@ impl Flow {
         }
     }
 
-    /// What a class could take of a node.
+    /// How much a class could take of a node.
     fn left(&self, class: usize, node: NodeId) -> Quantity {
         let Node { whole, all, taken_whole, taken_parts, .. } = &self.nodes[node.index()];
         let left = all.saturating_sub(*taken_whole + *taken_parts);

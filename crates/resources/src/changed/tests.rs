@@ -1,6 +1,6 @@
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
-//! Two pools go through the same history: one does all at once, and the other so little in each turn that it is behind after nearly
-//! every step. When that one has caught up, both have granted the same.
+//! Two pools go through the same history: one does all work at once, the other does so little in each turn that it is behind after nearly every step.
+//! When the second has caught up, both have granted the same.
 
 use crate::expiry::Work;
 use crate::{AcquireRequest, Limits, Pool, ResourceSpec, SessionId};
@@ -16,10 +16,10 @@ const KINDS: [&str; 2] = ["Tool", "Camera"];
 
 #[derive(Debug, Clone)]
 enum Step {
-    /// A resource of a kind with an attribute and a capacity, anew or otherwise than before.
+    /// Creates or changes a resource with this kind, attribute and capacity.
     Create(usize, usize, i64, u32),
     Delete(usize),
-    /// Who wants what, each of a kind, with an attribute where that is not zero, so many units, and how.
+    /// Acquires with these requirements: kind, attribute (unless zero), number of units, and options.
     Acquire(i64, Vec<(usize, i64, u32, usize)>),
     Release(usize),
     Cancel(usize),
@@ -45,7 +45,7 @@ fn pool(work: Work) -> Pool {
     pool
 }
 
-/// Leases by what they are for, in the order of that; what both pools have granted for the same request has the same purpose.
+/// The purposes of all leases, sorted; grants for the same request have the same purpose in both pools.
 fn granted(pool: &Pool) -> Vec<String> {
     let mut purposes: Vec<String> = pool.leases().iter().map(|lease| lease.purpose.to_string()).collect();
     purposes.sort();
@@ -135,7 +135,7 @@ fn a_pool_that_is_behind_for_long_holds_what_always_holds_and_forgets_nobody() {
             perform(&mut pool, number, step);
             pool.check_invariants().map_err(TestCaseError::fail)?;
         }
-        // Then it is not behind, and who could be served does not wait.
+        // When it is no longer behind, no request waits that could be served.
         while pool.next_deadline() == Some(NOW) {
             pool.advance(NOW);
             pool.check_invariants().map_err(TestCaseError::fail)?;
@@ -145,7 +145,7 @@ fn a_pool_that_is_behind_for_long_holds_what_always_holds_and_forgets_nobody() {
     outcome.unwrap();
 }
 
-/// Somebody has reserved one of three tools and waits for another; it is deleted, and a camera is in its slot before that is settled.
+/// A waiter has reserved one of three tools and waits for another; the reserved one is deleted, and a camera gets its slot before that is settled.
 #[test]
 fn what_was_reserved_of_a_deleted_resource_does_not_hide_the_next_one_in_its_slot() {
     let of = |kind: &str, count: u32| {
@@ -163,7 +163,7 @@ fn what_was_reserved_of_a_deleted_resource_does_not_hide_the_next_one_in_its_slo
         let held = pool.leases().remove(0).resources;
         let left = ["reserved", "held", "held too"].into_iter().find(|id| !held.contains(&(*id).to_owned())).unwrap();
         let waiter = pool.acquire(NOW, of("Tool", 2)).unwrap();
-        // Too little is done in each call for what is known of tools to be settled.
+        // Each call does too little work to settle the changes of tools.
         pool.work = Work { per_turn: 9, per_call: 3 };
         pool.delete(NOW, None, left).unwrap();
         pool.create(NOW, None, resource("Camera", "camera")).unwrap();

@@ -1,5 +1,4 @@
-//! Makes the checkpoints of a run that is under way: follows what replaying would come to, and hands a copy to the writer when one
-//! is due.
+//! Makes the checkpoints of a run: follows the state that a replay would give, and hands a copy to the writer when a checkpoint is due.
 
 use super::ReplayedState;
 use super::pace::Pace;
@@ -19,20 +18,20 @@ use std::time::{Duration, Instant};
 /// The checkpoints of one run.
 pub(crate) struct Checkpointer {
     log: PathBuf,
-    /// The task file's digest.
+    /// Digest of the task file.
     digest: String,
     ledger: Ledger,
     pace: Pace,
     /// When the last event was handled.
     last: Instant,
-    /// How long the run had to stop for the last checkpoint.
+    /// How long the run was blocked by the last checkpoint.
     stopped: Duration,
     writer: Writer,
 }
 
 impl Checkpointer {
-    /// For a run that writes a log and stands so, of which so many events are behind its last checkpoint. `None` where checkpoints
-    /// are not wanted, or not possible: the log is no file, or there is no thread.
+    /// The checkpointer of a run that writes this log and has this state, with `events` events since its last checkpoint. `None` if checkpoints are
+    /// disabled or impossible: the log is no file, or the thread cannot be started.
     pub(crate) fn start(
         log: &LogWriter,
         digest: &str,
@@ -66,7 +65,7 @@ impl Checkpointer {
         self.last = Instant::now();
     }
 
-    /// When a checkpoint is to be made if nothing happens until then.
+    /// When the next checkpoint is due if nothing happens until then.
     pub(crate) fn due(&mut self, log: &LogWriter) -> Option<Instant> {
         if let Some(took) = self.writer.took() {
             self.pace.took(Instant::now(), self.stopped + took);
@@ -74,7 +73,7 @@ impl Checkpointer {
         if self.writer.is_busy() { None } else { self.pace.due(self.last, log.written()) }
     }
 
-    /// Makes one. All that was logged has been performed.
+    /// Makes a checkpoint. All logged commands have been performed.
     pub(crate) fn make(
         &mut self,
         log: &LogWriter,
@@ -98,7 +97,7 @@ impl Checkpointer {
         tracing::debug!(stopped = ?self.stopped, log = %self.log.display(), "a checkpoint is being written");
     }
 
-    /// The run has ended.
+    /// The run has ended: removes its checkpoint.
     pub(crate) fn end(self) {
         let Checkpointer { log, writer, .. } = self;
         drop(writer);

@@ -1,9 +1,8 @@
-//! The form of a checkpoint file: what it is and in which format, how long the rest is, the rest's digest, and the rest, which is
-//! a header in JSON (as in the log, so that values read back as they do there) and the executive's state.
+//! The format of a checkpoint file: a magic number, the format version, the length of the rest, the digest of the rest, and the rest: a header in
+//! JSON (as in the log, so that values are read back identically) and the executive's state.
 //!
-//! A file that is torn, damaged, of another format or of another log is named as that and not used. One thing is refused: a log
-//! that is shorter than its own checkpoint says. The log is on the disk before its checkpoint is, so somebody has cut it, and
-//! motions that were begun might be begun again.
+//! A file that is torn, damaged, of another format or of another log is reported and not used. Only a log that is shorter than its own checkpoint
+//! says makes the run refuse: the log is synced before its checkpoint, so somebody has cut it, and motions that were begun might be begun again.
 
 use super::{Checkpoint, Place, ReplayedState, path_of};
 use crate::replay::VERSION;
@@ -13,46 +12,46 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
-/// What every checkpoint file begins with.
+/// The first bytes of every checkpoint file.
 const MAGIC: &[u8; 16] = b"ratn checkpoint\n";
-/// Its format. Another one is not read.
+/// The format version. Other versions are not read.
 const FORMAT: u32 = 7;
-/// The bytes before the rest: what it is, its format, how long the rest is and its digest.
+/// Number of bytes before the rest: magic number, format version, length and digest.
 const PREAMBLE: usize = MAGIC.len() + 4 + 8 + blake3::OUT_LEN;
-/// A run whose state is larger than this has no checkpoints.
+/// A run with a larger state has no checkpoints.
 pub(super) const MAX_BYTES: u64 = 1 << 30;
 
 /// Why a checkpoint is not used.
 #[derive(Debug, thiserror::Error)]
 pub enum FileError {
-    /// The operating system refuses it.
+    /// The operating system failed to read it.
     #[error("it cannot be read: {0}")]
     Io(#[from] io::Error),
-    /// It is some other file.
+    /// The file is not a checkpoint.
     #[error("it is not a checkpoint of a run")]
     NoCheckpoint,
-    /// It is of a format that is not known.
+    /// The file has an unknown format version.
     #[error("it is of format {theirs}, and this version of ratn reads {FORMAT}")]
     Format {
-        /// The number of that format.
+        /// The format version of the file.
         theirs: u32,
     },
-    /// Another version wrote it.
+    /// It was written by another version of ratn.
     #[error("it was written by ratn {theirs}, and this is {VERSION}")]
     Version {
-        /// That version.
+        /// The version that wrote it.
         theirs: String,
     },
-    /// Its digest is not that of its bytes.
+    /// The digest does not match the bytes.
     #[error("it is torn or damaged")]
     Torn,
-    /// Another run made it.
+    /// It belongs to another run.
     #[error("it is of another run")]
     OtherRun,
-    /// The log before its place is not the log that it was made of.
+    /// The log before the checkpoint's place has changed since.
     #[error("the log was edited, or is another one, before the place that it is of")]
     Edited,
-    /// The log is shorter than it was.
+    /// The log is shorter than when the checkpoint was made.
     #[error(
         "lines are missing at its end: it has {has} bytes, and had {had} when its checkpoint was made. What the run did on them might be \
          done again. Put the whole log back; or, if nothing can go wrong by that, remove the checkpoint beside it"
@@ -66,7 +65,7 @@ pub enum FileError {
 }
 
 impl FileError {
-    /// Whether the run must not be resumed from what there is of the log either.
+    /// Whether the run must not be resumed from the rest of the log either.
     pub(crate) fn refuses(&self) -> bool {
         matches!(self, FileError::Cut { .. })
     }
@@ -81,7 +80,7 @@ struct Header {
 }
 
 impl Checkpoint {
-    /// As it is in a file.
+    /// The checkpoint as the bytes of a file.
     pub(crate) fn encode(&self) -> io::Result<Vec<u8>> {
         let Checkpoint { digest, place, standing, executive } = self;
         let (version, digest) = (VERSION.to_owned(), digest.clone());
@@ -100,7 +99,7 @@ impl Checkpoint {
         Ok(bytes)
     }
 
-    /// The checkpoint of a file.
+    /// Reads a checkpoint from the bytes of a file.
     pub(crate) fn decode(bytes: &[u8]) -> Result<Checkpoint, FileError> {
         let (magic, rest) = bytes.split_first_chunk::<16>().ok_or(FileError::Torn)?;
         if magic != MAGIC {
@@ -119,7 +118,7 @@ impl Checkpoint {
         let (length, rest) = rest.split_first_chunk().ok_or(FileError::Torn)?;
         let length = usize::try_from(u64::from_le_bytes(*length)).map_err(|_| FileError::Torn)?;
         let (header, executive) = rest.split_at_checked(length).ok_or(FileError::Torn)?;
-        // The version first: another one may say the rest otherwise.
+        // The version is read first: another version may have another header.
         #[derive(Deserialize)]
         struct Version {
             version: String,
@@ -132,7 +131,7 @@ impl Checkpoint {
         Ok(Checkpoint { digest, place, standing, executive: executive.to_vec() })
     }
 
-    /// Whether it is of this log.
+    /// Checks that the checkpoint belongs to this log.
     fn fits(&self, log: &File, origin: &Origin, digest: &str) -> Result<(), FileError> {
         if self.standing.ledger.origin != *origin || self.digest != digest {
             return Err(FileError::OtherRun);
@@ -148,10 +147,10 @@ impl Checkpoint {
     }
 }
 
-/// The checkpoint of a log that begins with this origin and this digest of a task; `None` where there is no file.
+/// Reads the checkpoint of a log with this origin and this digest of the task; `None` if there is no file.
 ///
 /// # Errors
-/// Why it is not used.
+/// The reason why the checkpoint is not used.
 pub(crate) fn find(log: &Path, origin: &Origin, digest: &str) -> Result<Option<Checkpoint>, FileError> {
     let file = match ratn_regular_file::open(&path_of(log)) {
         Ok(file) => file,

@@ -1,12 +1,11 @@
-//! Checkpoints of a run, beside its event log as `LOG.checkpoint`: a run is resumed from the newest one and the lines behind it,
+//! Checkpoints of a run, in a file beside its event log, `LOG.checkpoint`: a run is resumed from the newest checkpoint and the log lines after it,
 //! however long its log is.
 //!
-//! A checkpoint holds all that replaying the log up to a place comes to (`ReplayedState`), and says which log and which place in it
-//! (`Place`). It only saves time: without one, or with one that does not fit, the whole log is replayed. What the log says is
-//! never changed for it.
+//! A checkpoint holds the state that a replay of the log up to a place gives (`ReplayedState`), and names the log and the place (`Place`). It only
+//! saves time: without a checkpoint, or with one that does not match, the whole log is replayed. The log is never changed for a checkpoint.
 //!
-//! `file` is the form of the file and its reading, `pace` says when one is due, `checkpointer` makes them during a run, and
-//! `writer` writes them in a thread of its own.
+//! `file` is the file format, `pace` decides when a checkpoint is due, `checkpointer` makes checkpoints during a run, and `writer` writes them in a
+//! separate thread.
 
 mod checkpointer;
 mod file;
@@ -28,24 +27,24 @@ use std::io;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
-/// So many bytes at the beginning of the log, and before the place, have to be what they were.
+/// This many bytes at the beginning of the log, and before the place, have to be unchanged.
 const COMPARED: u64 = 64 << 10;
 
-/// All that a run's log comes to up to a line, but for the executive.
+/// The state of a run after a log line, without the executive's state.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct ReplayedState {
     pub(super) ledger: Ledger,
-    /// Which states the instances are of.
+    /// The state of each instance.
     pub(super) states: BTreeMap<InstanceId, StateId>,
     pub(super) progress: Progress,
 }
 
-/// A place in a log, behind a whole line and all commands of its event.
+/// A place in a log, after a whole line and all commands of its event.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Place {
-    /// What is before it, in bytes
+    /// The number of bytes before it.
     pub(super) bytes: u64,
-    /// and in lines.
+    /// The number of lines before it.
     pub(super) lines: usize,
     /// Digests of the first and of the last [`COMPARED`] bytes before it.
     first: String,
@@ -53,7 +52,7 @@ pub(super) struct Place {
 }
 
 impl Place {
-    /// The place after so much of a log.
+    /// The place after `bytes` bytes and `lines` lines of a log.
     pub(super) fn of(log: &File, bytes: u64, lines: usize) -> io::Result<Place> {
         let compared = bytes.min(COMPARED);
         let digest = |from: u64| {
@@ -68,15 +67,15 @@ impl Place {
 /// A run's state at a place in its log.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Checkpoint {
-    /// The task file's digest.
+    /// Digest of the task file.
     pub(super) digest: String,
     pub(super) place: Place,
     pub(super) standing: ReplayedState,
-    /// The executive's state, in a form of its own.
+    /// The executive's state, in the executive's own format.
     pub(super) executive: Vec<u8>,
 }
 
-/// Where the checkpoint of a log is.
+/// The path of the checkpoint of a log.
 pub(super) fn path_of(log: &Path) -> PathBuf {
     let mut name = log.as_os_str().to_owned();
     name.push(".checkpoint");

@@ -1,32 +1,32 @@
-//! When the next checkpoint is due. Pure: the time comes in as an argument.
+//! Decides when the next checkpoint is due. Pure: the time is an argument.
 
 use std::time::{Duration, Instant};
 
-/// A checkpoint after so many events: reading and replaying them takes 0.24 s (measured: 5 lines of 160 bytes an event, optimised
-/// build, busy machine of two cores), and twice as many may be behind the last one.
+/// Number of events between checkpoints: reading and replaying them takes 0.24 s (measured: 5 lines of 160 bytes per event, optimised build, busy
+/// machine with two cores); there may be twice as many since the last checkpoint.
 pub const EVERY_EVENTS: u64 = 10_000;
-/// Or after so many bytes of the log, for lines are read and compared, too: events of some tasks carry trajectories and worlds.
+/// Number of log bytes between checkpoints, because lines also have to be read and compared: events of some tasks carry trajectories and worlds.
 const EVERY_BYTES: u64 = 8 << 20;
-/// A checkpoint waits until no event has come for so long, so that it does not delay commands.
+/// A checkpoint waits until no event has come for this long, so that it does not delay commands.
 const QUIET: Duration = Duration::from_millis(20);
-/// It waits no longer than until this many times the events or bytes are behind the last one.
+/// A checkpoint stops waiting when there are this many times the events or bytes since the last one.
 const PATIENCE: u64 = 2;
-/// Between two checkpoints is this many times the time that one takes: they take at most 2 % of a run.
+/// The pause between two checkpoints is this multiple of the time that one takes: checkpoints take at most 2 % of a run.
 const SHARE: u32 = 50;
 
-/// How far a run is behind its last checkpoint.
+/// The progress of a run since its last checkpoint.
 #[derive(Debug)]
 pub(super) struct Pace {
     every_events: u64,
-    /// Since the last one.
+    /// Events since the last checkpoint.
     events: u64,
-    /// The log's length at the last one.
+    /// The length of the log at the last checkpoint.
     bytes: u64,
     not_before: Option<Instant>,
 }
 
 impl Pace {
-    /// For a log of so many bytes, of which so many events are behind the last checkpoint.
+    /// For a log of `bytes` bytes with `events` events since the last checkpoint.
     pub(super) fn new(every_events: u64, events: u64, bytes: u64) -> Pace {
         Pace { every_events, events, bytes, not_before: None }
     }
@@ -36,8 +36,8 @@ impl Pace {
         self.events += 1;
     }
 
-    /// When a checkpoint may be made if nothing happens until then; `None` where none is due. `now` is when the last event was
-    /// handled, `bytes` the log's length.
+    /// When a checkpoint may be made if nothing happens until then; `None` if none is due. `now` is when the last event was handled, `bytes` the
+    /// length of the log.
     pub(super) fn due(&self, now: Instant, bytes: u64) -> Option<Instant> {
         let behind = |times: u64| {
             self.events >= self.every_events.saturating_mul(times)
@@ -50,12 +50,12 @@ impl Pace {
         Some(self.not_before.map_or(quiet, |not_before| quiet.max(not_before)))
     }
 
-    /// A checkpoint was made of a log of so many bytes.
+    /// A checkpoint was made when the log had this many bytes.
     pub(super) fn made(&mut self, bytes: u64) {
         (self.events, self.bytes) = (0, bytes);
     }
 
-    /// It took so long, until now.
+    /// A checkpoint has been written; it took this long.
     pub(super) fn took(&mut self, now: Instant, duration: Duration) {
         self.not_before = now.checked_add(duration.saturating_mul(SHARE));
     }
@@ -76,7 +76,7 @@ mod tests {
         assert_eq!(pace.due(now, 100 + EVERY_BYTES), Some(now + QUIET));
         pace.event();
         assert_eq!(pace.due(now, 200), Some(now + QUIET));
-        // A run that is never quiet has checkpoints, too.
+        // A run that is never quiet also gets checkpoints.
         (0..3).for_each(|_| pace.event());
         assert_eq!(pace.due(now, 200), Some(now));
         pace.made(200);

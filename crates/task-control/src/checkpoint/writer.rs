@@ -1,5 +1,5 @@
-//! Writes checkpoints in a thread of its own: encoded, written to a file beside, synced and renamed, so that there is always a
-//! whole one. The log is synced before: no checkpoint on the disk knows more than the log there.
+//! Writes checkpoints in a separate thread: each is encoded, written to a new file, synced and renamed, so that a complete one always exists. The log
+//! is synced first: no checkpoint on disk is ahead of the log on disk.
 
 use super::file::MAX_BYTES;
 use super::{Checkpoint, Place, ReplayedState, path_of};
@@ -10,17 +10,17 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// What is to be written.
+/// A checkpoint to be written.
 pub(super) struct Job {
     pub(super) digest: String,
-    /// The log's length then.
+    /// The length of the log at the checkpoint.
     pub(super) bytes: u64,
     pub(super) lines: usize,
     pub(super) standing: ReplayedState,
     pub(super) executive: Vec<u8>,
 }
 
-/// The thread. It writes one checkpoint at a time, and the next is made when this one is written.
+/// The writing thread. It writes one checkpoint at a time; the next one is made when this one is written.
 pub(super) struct Writer {
     jobs: Option<SyncSender<Job>>,
     written: Receiver<Duration>,
@@ -29,7 +29,7 @@ pub(super) struct Writer {
 }
 
 impl Writer {
-    /// For the checkpoints of a log.
+    /// Starts the writer for the checkpoints of a log.
     pub(super) fn start(log: &Path) -> io::Result<Writer> {
         let (jobs, received) = sync_channel::<Job>(1);
         let (done, written) = sync_channel(1);
@@ -38,7 +38,7 @@ impl Writer {
             let mut complained = false;
             for job in received {
                 let began = Instant::now();
-                // A run goes on without checkpoints; the operator hears of it once.
+                // A run goes on without checkpoints; the operator is told once.
                 if let Err(error) = write(&log, job)
                     && !std::mem::replace(&mut complained, true)
                 {
@@ -50,7 +50,7 @@ impl Writer {
         Ok(Writer { jobs: Some(jobs), written, busy: false, thread: Some(thread) })
     }
 
-    /// How long the last checkpoint took, where that was not asked before.
+    /// How long the last checkpoint took; `None` if it is not done or was reported before.
     pub(super) fn took(&mut self) -> Option<Duration> {
         let took = self.written.try_recv().ok()?;
         self.busy = false;
@@ -62,14 +62,14 @@ impl Writer {
         self.busy
     }
 
-    /// Begins to write one.
+    /// Begins to write a checkpoint.
     pub(super) fn write(&mut self, job: Job) {
         self.busy = self.jobs.as_ref().is_some_and(|jobs| jobs.try_send(job).is_ok());
     }
 }
 
 impl Drop for Writer {
-    /// Waits for a checkpoint that is being written: whoever goes on with the log or removes the file finds nobody at it.
+    /// Waits for a checkpoint that is being written, so that nobody writes when the log is resumed or the file removed.
     fn drop(&mut self) {
         self.jobs = None;
         if let Some(thread) = self.thread.take() {
@@ -110,7 +110,7 @@ fn new_path_of(log: &Path) -> PathBuf {
     name.into()
 }
 
-/// Takes away what there is: nobody resumes a run that has ended.
+/// Removes the checkpoint files: a run that has ended is not resumed.
 pub(super) fn remove(log: &Path) {
     for path in [path_of(log), new_path_of(log)] {
         match std::fs::remove_file(&path) {

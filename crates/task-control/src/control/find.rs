@@ -1,4 +1,4 @@
-//! The runs that listen in a runtime directory, each at a socket of its own, and which of them is meant.
+//! Finds the runs that listen in a runtime directory, each at its own socket, and the one that a client means.
 
 use super::{ANY_RUN, MAX_STATUS_BYTES, RunStatus, STATUS, is_nobody, say};
 use futures::future::join_all;
@@ -7,17 +7,17 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tokio::net::UnixStream;
 
-/// A run that does not say what it is doing within this time keeps nobody waiting who asks about all of them.
+/// A run that does not answer within this time is left out of lists of all runs.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// Of a run's socket, behind its id.
+/// The extension of a run's socket; the name is the run's id.
 const ENDING: &str = "control";
 
-/// Where a run listens.
+/// The path of a run's socket.
 pub(super) fn socket(directory: &Path, run: &str) -> PathBuf {
     directory.join(format!("{run}.{ENDING}"))
 }
 
-/// Sockets at which nobody listens any more are taken away: their runs were killed.
+/// Removes the sockets at which nobody listens: their runs were killed.
 pub(super) async fn sweep(directory: &Path) {
     for (_, path) in sockets(directory) {
         if UnixStream::connect(&path).await.is_err_and(|error| error.kind() == ErrorKind::ConnectionRefused) {
@@ -26,16 +26,16 @@ pub(super) async fn sweep(directory: &Path) {
     }
 }
 
-/// What the runs of the system in `directory` are doing, in the order of their ids. One that does not say is left out.
+/// The status of each run of the system in `directory`, ordered by id. Runs that do not answer are left out.
 pub async fn statuses(directory: &Path) -> Vec<RunStatus> {
     let asked = sockets(directory).into_iter().map(async |(_, path)| ask(&path).await);
     join_all(asked).await.into_iter().filter_map(Result::ok).collect()
 }
 
-/// What one run is doing: of this id or this task, or whichever is under way. `None` where none is.
+/// The status of one run, given by its id, its task or [`ANY_RUN`]. `None` if no run is under way.
 ///
 /// # Errors
-/// Where it does not say, or it is not known which is meant.
+/// The run does not answer, or it is unclear which run is meant.
 pub async fn status(directory: &Path, run: &str) -> Result<Option<RunStatus>> {
     match meant(directory, run).await {
         Ok(path) => ask(&path).await.map(Some),
@@ -44,10 +44,10 @@ pub async fn status(directory: &Path, run: &str) -> Result<Option<RunStatus>> {
     }
 }
 
-/// Where the run that is meant listens: by its id, the name of its task, or [`ANY_RUN`] where only one is under way.
+/// The socket of the run that is meant: by its id, the name of its task, or [`ANY_RUN`] if only one is under way.
 ///
 /// # Errors
-/// [`is_nobody`] where no run is under way; else which there are.
+/// [`is_nobody`] if no run is under way; else an error that lists the runs.
 pub(super) async fn meant(directory: &Path, run: &str) -> Result<PathBuf> {
     let mut listening = Vec::new();
     for (id, path) in sockets(directory) {
@@ -67,7 +67,7 @@ pub(super) async fn meant(directory: &Path, run: &str) -> Result<PathBuf> {
     let tasks = join_all(listening.iter().map(async |(_, path)| ask(path).await.map(|status| status.task))).await;
     let known = || listening.iter().zip(&tasks).filter_map(|((id, path), task)| Some((id, path, task.as_ref().ok()?)));
     let mut of_task = known().filter(|(.., task)| run == task.as_str());
-    // One that does not say its task may be of this one, too.
+    // A run that does not tell its task may have the same task.
     if let (Some((_, path, _)), None, true) = (of_task.next(), of_task.next(), tasks.iter().all(Result::is_ok)) {
         return Ok(path.clone());
     }
@@ -90,7 +90,7 @@ async fn ask(socket: &Path) -> Result<RunStatus> {
     serde_json::from_str(&answer).map_err(|_| Error::other(answer))
 }
 
-/// The ids of runs, with their sockets, in the order of the ids.
+/// The ids of the runs with their sockets, ordered by id.
 fn sockets(directory: &Path) -> Vec<(String, PathBuf)> {
     let entries = std::fs::read_dir(directory).into_iter().flatten().flatten();
     let of_run = |path: PathBuf| {

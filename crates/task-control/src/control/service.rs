@@ -1,8 +1,8 @@
-//! gRPC in front of a run's ear: signals, answers and breakpoints from clients of any language, and what is waited for.
+//! The gRPC service of the runs: signals, answers and breakpoints from clients of any language, and what the states wait for.
 //!
-//! It says the same as the sockets of [`super`], which it tells. Served at the Unix socket `run.sock` of the runtime directory, whose
-//! endpoint file is `run.endpoint`, by one of the runs for all of them; when that ends, by the next one. Who may is what the table of roles says
-//! of a process without a config of its own.
+//! It answers the same as the sockets of [`super`], to which it forwards. One of the runs serves it for all of them, at the Unix socket `run.sock` of
+//! the runtime directory, with the endpoint file `run.endpoint`; when that run ends, the next one takes over. Access is checked by the default table
+//! of roles, for processes without a config.
 
 use super::{ANY_RUN, Asked, Awaiting, Message, RunStatus, find, is_nobody, is_uncertain, send};
 use futures::FutureExt;
@@ -21,23 +21,23 @@ use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status};
 
-/// Under this name a run is found in the runtime directory.
+/// The role name of the service in the runtime directory.
 pub const ROLE: &str = "run";
 
-/// So often a run looks whether nobody serves any more.
+/// Interval at which a run tries to take over the service.
 const TURN: Duration = Duration::from_millis(200);
 
 /// Serves the [`RunService`] of the runs in a directory.
 #[derive(Debug, Clone)]
 pub struct RunServer {
     directory: PathBuf,
-    /// Where the own run listens.
+    /// The socket of the run in this process.
     socket: PathBuf,
     tell: mpsc::Sender<Asked>,
 }
 
 impl RunServer {
-    /// Of no run: every call that is let in is refused. For tests of who is.
+    /// Serves no run: every admitted call is refused. For tests of access control.
     pub fn of_nobody() -> RunServer {
         RunServer { directory: PathBuf::new(), socket: PathBuf::new(), tell: mpsc::channel(1).0 }
     }
@@ -46,12 +46,12 @@ impl RunServer {
         RunServer { directory: directory.to_owned(), socket: find::socket(directory, run), tell }
     }
 
-    /// For [`Services::with`].
+    /// The gRPC service, for [`Services::with`].
     pub fn into_service(self) -> RunServiceServer<RunServer> {
         RunServiceServer::new(self)
     }
 
-    /// Serves it in a runtime directory until `end`, from when no other run does.
+    /// Serves in a runtime directory until `end`, as soon as no other run does.
     pub(super) async fn serve(self, directory: &Path, end: CancellationToken) -> Result<(), ServeProblem> {
         let directory = RuntimeDirectory::at(directory);
         let bound = loop {
@@ -69,7 +69,7 @@ impl RunServer {
         Ok(bound.serve(Services::new().with(self.into_service()), end).boxed().await?)
     }
 
-    /// Whether a run is the own one, of those that there are.
+    /// Whether a run is the one in this process.
     async fn is_own(&self, run: &str) -> Result<bool, Status> {
         match find::meant(&self.directory, run).await {
             Ok(socket) => Ok(socket == self.socket),
@@ -109,7 +109,7 @@ impl RunServer {
     }
 }
 
-/// Why a run is not served.
+/// Why the service cannot be served.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum ServeProblem {
     #[error(transparent)]

@@ -1,4 +1,4 @@
-//! Logs on the disk with checkpoints beside them: whatever has become of either, a run is resumed rightly or not at all.
+//! Logs on disk with checkpoints beside them: whatever happens to either, a run is resumed correctly or not at all.
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
@@ -14,7 +14,7 @@ use ratn_model::tolerance::Tolerance;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// A run as task control makes it, in a folder of its own.
+/// A run as made by task control, in its own folder.
 struct Bench {
     folder: tempfile::TempDir,
     program: Arc<Program>,
@@ -36,7 +36,7 @@ impl Bench {
         path_of(&self.log())
     }
 
-    /// Goes on with events until there are so many lines, with a checkpoint behind `place` of them; and is killed.
+    /// Runs until the log has `lines` lines, with a checkpoint after `place` of them, and is then killed.
     fn run(&self, events: impl Iterator<Item = (Timestamp, Event)>, place: usize, lines: usize) {
         let mut writer = LogWriter::create(&self.log()).unwrap();
         let mut checkpointer = Checkpointer::start(&writer, &self.program.digest, 1, Ledger::default(), 0).unwrap();
@@ -53,7 +53,7 @@ impl Bench {
             progress.follow(at, &event, &commands);
             if writer.lines() >= place && !self.checkpoint().exists() {
                 checkpointer.make(&writer, &executive, &states, &progress, Confirmed::default());
-                // It is there before the run goes on.
+                // The checkpoint is written before the run goes on.
                 while checkpointer.is_busy() {
                     std::thread::yield_now();
                 }
@@ -73,7 +73,7 @@ impl Bench {
         History::of(&writer, Messages::nowhere())?.replay(&self.program)
     }
 
-    /// Resumes, and says how many lines were not read.
+    /// Resumes the run, and returns how many lines were not read.
     fn resumes_behind(&self) -> usize {
         let (replayed, read) = self.resume().unwrap();
         let whole = replay::replay(&self.program, &log::read(&self.log()).unwrap().lines).unwrap();
@@ -97,7 +97,7 @@ fn a_run_is_resumed_from_its_checkpoint_and_the_lines_behind_it() {
         let bench = Bench::new(mode);
         bench.run(bench.events(), 100, 180);
         assert!(bench.resumes_behind() >= 100);
-        // What is torn behind it is left out as ever, with its number in the whole log.
+        // A torn line after the checkpoint is dropped as usual, with its number in the whole log.
         let lines = log::read(&bench.log()).unwrap().lines.len();
         rewrite(&bench.log(), |log| log.extend(b"{\"at\":1,"));
         assert_eq!(bench.resume().unwrap().1.torn, Some(lines + 1));
@@ -129,7 +129,7 @@ fn a_checkpoint_that_is_torn_or_damaged_anywhere_is_not_used() {
         std::fs::write(bench.checkpoint(), other).unwrap();
         assert_eq!(bench.resumes_behind(), 0);
     }
-    // Of an older or newer format.
+    // Of an older or newer format version.
     std::fs::write(bench.checkpoint(), &whole).unwrap();
     rewrite(&bench.checkpoint(), |bytes| bytes[16] += 1);
     assert!(find().unwrap_err().to_string().contains("of format 8"));
@@ -151,7 +151,7 @@ fn a_checkpoint_of_another_run_or_of_a_log_that_was_edited_is_not_used() {
     std::fs::copy(other.checkpoint(), bench.checkpoint()).unwrap();
     assert_eq!(bench.resumes_behind(), 0);
 
-    // Edited so that every line is valid and the log is as long as before.
+    // Edited so that every line is valid and the log keeps its length.
     std::fs::write(bench.checkpoint(), ours).unwrap();
     assert!(bench.resumes_behind() > 0);
     rewrite(&bench.log(), |log| {
@@ -173,7 +173,7 @@ fn a_log_that_is_shorter_than_its_checkpoint_says_is_refused() {
     let before = bench.resumes_behind();
     let place: usize =
         std::fs::read_to_string(bench.log()).unwrap().lines().take(before).map(|line| line.len() + 1).sum();
-    // All that is behind the checkpoint may be gone, and nothing more.
+    // The log may lose everything after the checkpoint, but not more.
     rewrite(&bench.log(), |log| log.truncate(place));
     assert_eq!(bench.resumes_behind(), before);
     rewrite(&bench.log(), |log| log.truncate(place - 1));
@@ -187,7 +187,7 @@ fn a_log_that_is_shorter_than_its_checkpoint_says_is_refused() {
 fn a_state_that_does_not_fit_the_lines_behind_it_is_not_used() {
     let bench = Bench::new(Mode::Cdtn);
     bench.run(bench.events(), 100, 180);
-    // An executive that cannot be restored, and one that would have said something else.
+    // A state that cannot be restored, and one that gives other commands.
     let file = std::fs::read(bench.checkpoint()).unwrap();
     for executive in [b"what?".to_vec(), Executive::new(bench.program.clone(), Tolerance::ROBOT).checkpoint()] {
         let checkpoint = Checkpoint { executive, ..Checkpoint::decode(&file).unwrap() };
@@ -211,7 +211,7 @@ fn a_run_that_has_ended_leaves_no_checkpoint() {
 fn what_is_read_of_a_long_log_is_what_is_behind_its_checkpoint() {
     const EVENTS: usize = 200_000;
     let bench = Bench::new(Mode::Cdtn);
-    // A goal that says all day how far it is.
+    // A goal that reports progress all the time.
     let says = |number: u64| {
         let (instance, attempt, message) = (InstanceId(1), 1, format!("step {number}"));
         (Timestamp::from_seconds(1e3), Event::Progressed { instance, attempt, message })

@@ -1,10 +1,11 @@
-//! What others have changed since a run lost what it held: a commit that it had decided before, or that a motion leads to which it had begun before,
-//! is made only where that is not what the commit is made of, or overwrites.
+//! Detects changes by others since a run lost its resources. A commit that was decided before the loss, or that belongs to a motion begun before it,
+//! is made only if others have not changed the facts that the commit is based on or overwrites.
 //!
-//! The same of a commit that is so late that whoever holds now what its run has given back does not wait for it any more.
+//! The same check applies to a commit that is so late that the next holder of a resource which the run has released does not wait for it any more.
 //!
-//! From when on others count the log says ([`Ledger`]), however often the run was taken up since. It is looked at when a commit is decided, so that
-//! nothing begins behind one that is refused, and once more when it is made ([`Untouched`]), as it may have waited for a slow disk.
+//! The log says from which revision on changes by others count ([`Ledger`]), even after several resumptions. The check is made when a commit is
+//! decided, so that nothing begins after a refused commit, and again when the commit is made ([`Untouched`]), because it may have waited for a slow
+//! disk.
 
 use super::told::{PENDING_PATIENCE, maker};
 use crate::decided::{Unanswered, Undone, insist};
@@ -23,28 +24,28 @@ use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// The world pool does not keep a revision any more.
+/// Reason code: the world pool does not keep a revision any more.
 const FORGOTTEN: &str = "REVISION_FORGOTTEN";
-/// So often the oldest revision is asked for.
+/// Maximum number of requests for the oldest revision.
 const TRIES: u32 = 8;
 
-/// What others have changed in some revisions of the root.
+/// The facts that others have changed in a range of revisions of the root.
 #[derive(Debug, Default)]
 pub(super) struct ChangedByOthers {
-    /// What was changed up to this one is not known.
+    /// Exclusive start of the range: earlier changes are unknown.
     behind: Revision,
-    /// What was changed behind this one is not known either.
+    /// Inclusive end of the range: later changes are unknown.
     up_to: Revision,
-    /// The last of these revisions in which each fact was changed.
+    /// For each changed fact, the last revision of the range that changed it.
     facts: BTreeMap<FactKey, Revision>,
 }
 
-/// What stands against a commit.
+/// Why a commit must not be made.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Overtaken {
-    /// Others have changed this fact, which it changes or is made of.
+    /// Others have changed this fact, which the commit changes or is based on.
     By(FactKey),
-    /// The world pool does not go back to where the run had what it held.
+    /// The world pool's history does not reach back to when the run had its resources.
     Unknown,
 }
 
@@ -65,7 +66,7 @@ impl fmt::Display for Overtaken {
     }
 }
 
-/// Asks anew where others have made the oldest revision leave the pool since that was asked for.
+/// Asks again if the oldest revision has left the pool's history since it was asked for.
 pub(super) async fn retry_forgotten<T, F>(mut ask: impl FnMut() -> F) -> Result<T, CallError>
 where
     F: Future<Output = Result<T, CallError>>,
@@ -80,7 +81,7 @@ where
 }
 
 impl ChangedByOthers {
-    /// What others than a run have changed behind a revision, as far as the pool keeps that, up to another one that it has had.
+    /// The changes by others than the run after a revision, as far as the pool keeps it, up to another revision that the pool has reached.
     pub(super) async fn of(
         world: &WorldClient,
         run: &str,
@@ -96,7 +97,7 @@ impl ChangedByOthers {
         behind: Revision,
         up_to: Revision,
     ) -> Result<ChangedByOthers, CallError> {
-        // Any fact says how far back the pool can tell.
+        // The history of any fact tells how far back the pool's history reaches.
         let any = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
         let (_, oldest) = world.history(any).await?;
         let behind = behind.max(oldest);
@@ -118,7 +119,7 @@ impl ChangedByOthers {
         Ok(changed)
     }
 
-    /// The next revision.
+    /// Adds the next revision.
     fn add(&mut self, run: &str, change: &WorldChange) {
         if maker(&change.commit).is_none_or(|(maker, _)| maker != run) {
             let facts = change.written.iter().map(|fact| &fact.key).chain(&change.gone);
@@ -127,7 +128,7 @@ impl ChangedByOthers {
         self.up_to = change.revision;
     }
 
-    /// What stands against changes of a state where others' changes behind a revision count.
+    /// Why a state's changes must not be committed, if changes by others after revision `behind` count.
     pub(super) fn overtakes(
         &self,
         program: &Program,
@@ -144,46 +145,46 @@ impl ChangedByOthers {
     }
 }
 
-/// Of a run that came back without what it held, while anything of before is under way.
+/// Checks the commits of a run that was resumed without its resources, while work from before is under way.
 pub(super) struct CameBetween {
     program: Arc<Program>,
     run: String,
-    /// What has begun, before and since.
+    /// The beginnings of all instances, before and after the resumption.
     beginnings: Beginnings,
     changed: ChangedByOthers,
 }
 
 impl CameBetween {
-    /// By the log, and what others have changed.
+    /// From the log, and the changes by others.
     pub(super) fn new(program: &Arc<Program>, run: &str, ledger: &Ledger, changed: ChangedByOthers) -> CameBetween {
         let beginnings = ledger.beginnings.clone();
         CameBetween { program: Arc::clone(program), run: run.to_owned(), beginnings, changed }
     }
 
-    /// The root has this revision, too.
+    /// The root has reached another revision.
     pub(super) fn told(&mut self, change: &WorldChange) {
         self.changed.add(&self.run, change);
     }
 
-    /// An event that the run is given, which knows of this revision.
+    /// The run handles an event, and knows the root up to this revision.
     pub(super) fn event(&mut self, event: &Event, knows: Revision) {
         self.beginnings.event(event, knows);
     }
 
-    /// A command that it performs. Of a commit [`CameBetween::check`] is asked before.
+    /// The run performs a command. For a commit, [`CameBetween::check`] is called first.
     pub(super) fn command(&mut self, command: &Command, knows: Revision) {
         self.beginnings.command(command, knows);
     }
 
-    /// Whether nothing is left of which it could say anything.
+    /// Whether all work from before the loss has ended.
     pub(super) fn is_over(&self) -> bool {
         self.beginnings.others_count().is_none()
     }
 
-    /// Under which condition a commit is made, where the command is one of what had begun before.
+    /// The condition for a commit of work that had begun before the loss; `None` for other commands.
     ///
     /// # Errors
-    /// With what others have changed, as far as that was told.
+    /// Others have changed the facts, as far as the pool has reported.
     pub(super) fn check(&self, command: &Command) -> anyhow::Result<Option<Untouched>> {
         let Command::Commit { instance, writer, changes, .. } = command else { return Ok(None) };
         let began = self.beginnings.of(*instance, writer);
@@ -195,35 +196,36 @@ impl CameBetween {
     }
 }
 
-/// Refuses to go on where others have changed what a commit overwrites or is made of.
+/// Fails: others have changed what a commit overwrites or is based on.
 pub(super) fn refuse<T>(writer: &str, overtaken: &Overtaken) -> anyhow::Result<T> {
     bail!(
         "what {writer} has changed is not in the world yet, and {overtaken}: run the task again, or begin it in the middle (`--from`)"
     );
 }
 
-/// The condition of a commit: others have not changed what it overwrites or is made of behind a revision up to the very one on which it is made.
+/// The condition of a commit: in the revisions after `seen`, up to the one that the commit is made on, others have not changed what it overwrites or
+/// is based on.
 #[derive(Debug)]
 pub(crate) struct Untouched {
     program: Arc<Program>,
     run: String,
-    /// Up to here that is so.
+    /// The last revision that has been checked.
     seen: Revision,
-    /// The commit's number in its run, where others count only when it is late.
+    /// The commit's number in its run, if the condition only applies when the commit is late.
     late: Option<(Left, Revision)>,
 }
 
-/// From when on others may not wait any more for what a run had decided when it gave something back. Clones share it.
+/// The deadlines after which the next holders of released resources do not wait for the run's decided commits any more. Clones share them.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Left(Arc<Mutex<VecDeque<(Revision, Instant)>>>);
 
 impl Left {
-    /// Something goes back while the commits up to `decided`, but for those up to `made`, are on their way.
+    /// A resource is released while the commits after `made` up to `decided` have not reached the world pool.
     pub(super) fn goes_back(&self, decided: Revision, made: Revision, at: Instant) {
         self.is_waited_for(decided, made, at + PENDING_PATIENCE);
     }
 
-    /// The same went back so long ago, before its run was taken up; in the order in which that was.
+    /// A resource was released this long ago, before the run was resumed; to be called in the order of releases.
     pub(super) fn went_back(&self, decided: Revision, made: Revision, ago: Duration) {
         self.is_waited_for(decided, made, Instant::now() + PENDING_PATIENCE.saturating_sub(ago));
     }
@@ -239,15 +241,15 @@ impl Left {
         }
     }
 
-    /// Whether whoever holds now what the run held when it decided this commit may have gone on without it.
+    /// Whether the next holder of what the run held when it decided this commit may have gone on without the commit.
     pub(super) fn is_late(&self, commit: Revision) -> bool {
         let left = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        // In the order of numbers, and of time.
+        // Ordered by number and by time.
         let first = left.iter().find(|(number, _)| *number >= commit);
         first.is_some_and(|(_, until)| Instant::now() >= *until)
     }
 
-    /// Nobody waits for anything any more.
+    /// For tests: no holder waits any more.
     #[cfg(test)]
     pub(super) fn all_is_late(&self) {
         let mut left = self.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -256,20 +258,20 @@ impl Left {
 }
 
 impl Untouched {
-    /// Up to this revision it is so.
+    /// The condition, checked up to revision `seen`.
     pub(super) fn behind(program: &Arc<Program>, run: &str, seen: Revision) -> Untouched {
         Untouched { program: Arc::clone(program), run: run.to_owned(), seen, late: None }
     }
 
-    /// It counts only when the run's commit of this number is later than others wait for it.
+    /// Applies the condition only if the run's commit with this number is late.
     pub(super) fn when_late(self, left: &Left, commit: Revision) -> Untouched {
         Untouched { late: Some((left.clone(), commit)), ..self }
     }
 
-    /// Looks whether it is so up to another revision.
+    /// Checks the condition up to another revision.
     ///
     /// # Errors
-    /// [`Undone::Overtaken`] where it is not.
+    /// [`Undone::Overtaken`] if it does not hold.
     pub(crate) async fn up_to(
         &mut self,
         root: Revision,

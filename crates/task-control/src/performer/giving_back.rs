@@ -1,5 +1,5 @@
-//! What an instance of a run gives back: its lease, with word of what the run has committed, and its projection. Each when nothing works with it any
-//! more, and what was decided before is on the disk. Nothing waits for that but operations.
+//! Releases what an instance held: its lease, with a note about what the run has committed, and its projection. Each is released when nothing uses it
+//! any more and earlier decisions are on disk. Only operations wait for a release.
 
 use super::{Job, Performer};
 use crate::decided::{Unanswered, insist};
@@ -14,7 +14,7 @@ use std::time::Instant;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 impl Performer {
-    /// What an instance held goes back when its goals, and those under the same lease, have ended.
+    /// Releases what an instance held when its goals, and those under the same lease, have ended.
     pub(super) fn release(
         &mut self,
         instance: InstanceId,
@@ -31,7 +31,7 @@ impl Performer {
         self.give_back_when(safe, instance, idle, lease, projection, None);
     }
 
-    /// What it was given and does not want any more goes back.
+    /// Releases what an instance was granted and does not want any more.
     pub(super) fn give_back(
         &mut self,
         instance: InstanceId,
@@ -67,11 +67,11 @@ impl Performer {
             None => (None, None),
         };
         let returning = async move {
-            // Whoever gets the resources next finds them idle.
+            // The next holder of the resources finds them idle.
             for goal in idle {
                 goal.cancelled().await;
             }
-            // What others do then stands on what is known here.
+            // What others then do may depend on what this run has decided.
             if let Some(safe) = safe {
                 safe.safe().await;
             }
@@ -80,13 +80,13 @@ impl Performer {
             }
             if let Some(lease) = lease {
                 let release = || resources.release_with_note(lease, note.clone());
-                // A resource manager that is away holds it until it is told: it is waited for as long as the session may live.
+                // An absent resource manager keeps the lease until it is told: wait for it as long as the session may live.
                 if let Err(undone) = insist(&trust, Unanswered::Waits, release).await {
                     tracing::warn!(%instance, "a lease was not given back: {undone}");
                 }
             }
             drop((returns, withdrawn));
-            // The lease is not kept until it is there.
+            // The release of the lease does not wait until a promised projection exists.
             if let Some((projection, coming)) = coming
                 && coming.await.is_ok()
             {

@@ -1,4 +1,4 @@
-//! One goal, from giving it to a provider (or finding it there again) to the event of its end.
+//! The life of one goal, from giving it to a provider (or finding it there again) to the event of its end.
 
 use super::Answer;
 use super::told::Told;
@@ -24,40 +24,39 @@ use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
-/// A provider that was told to stop and does not is left alone after this long.
+/// A cancelled goal whose provider does not end it within this time is abandoned.
 const CANCEL_DEADLINE: Duration = Duration::from_secs(2);
-/// So often it is told to stop where it was not under way yet.
+/// Interval between cancels while the provider does not know the goal yet.
 const TELL_AGAIN: Duration = Duration::from_millis(50);
-/// How long a goal goes on without task control, so that a run that is resumed finds it under way: as long as its lease would
-/// live.
+/// How long a goal goes on without task control, so that a resumed run finds it under way: as long as its lease would live.
 pub(super) const GRACE_MS: u64 = DEFAULT_TTL.as_millis() as u64;
-/// How long the resource of a provider that is gone may still be there: its process manager withdraws it at once, and where that one is
-/// gone too it ends with its session.
+/// How long the resource of a provider that has ended may still exist: its process manager withdraws it at once, and if that has ended too, the
+/// resource ends with its session.
 const WITHDRAWAL_DEADLINE: Duration = Duration::from_secs(DEFAULT_TTL.as_secs() + 1);
-/// A provider refuses a goal so while one of another run, that it has been told to stop, still runs.
+/// Reason code: the provider still runs another run's cancelled goal.
 const STILL_RUNNING: &str = "STILL_RUNNING";
-/// A worker that refuses for that is kept for so long before another one is asked for: at once it would be the same one again.
+/// A worker that refuses for this reason is kept this long before another one is acquired: an immediate acquire would get the same worker again.
 const STILL_RUNNING_PAUSE: Duration = Duration::from_secs(5);
-/// How often a withdrawal is looked at.
+/// Interval at which the withdrawal of a resource is checked.
 const WITHDRAWAL_POLL: Duration = Duration::from_millis(100);
-/// Who does not say within this time how a provider ended is not waited for.
+/// How long to wait for a process manager to say how a provider ended.
 const END_DEADLINE: Duration = Duration::from_secs(1);
-/// How much longer than its time a session may be seen.
+/// How much longer than its time to live a session may still be visible.
 const SESSION_SLACK: Duration = Duration::from_millis(500);
-/// The executive ends a goal that takes too long. The provider does so this much later, where nobody tells it to.
+/// The executive ends a goal that takes too long. The provider does so this much later, in case the cancel does not arrive.
 const DEADLINE_SLACK: Duration = Duration::from_millis(500);
 
-/// So many results of one goal are taken; each is a line of the event log.
+/// Maximum number of intermediate results of one goal; each is a line of the event log.
 const MOST_RESULTS: u32 = 256;
 
-/// Beside other runs, so often it is looked whether a goal has given its first result.
+/// Interval, beside other runs, at which to check whether a goal has given its first result.
 const LOOK_AGAIN: Duration = Duration::from_millis(20);
 
-/// The results that a goal has given before its end.
+/// The intermediate results of a goal.
 #[derive(Debug)]
 pub(super) struct Results {
     taken: u32,
-    /// What the last one costs.
+    /// The cost of the last one, in seconds.
     cost_s: f64,
 }
 
@@ -68,7 +67,7 @@ impl Default for Results {
 }
 
 impl Results {
-    /// Whether a result that costs so much is taken: the first, or a better one.
+    /// Whether a result with this cost is accepted: the first one, or a better one.
     fn takes(&mut self, cost_s: f64) -> bool {
         let takes = cost_s < self.cost_s && self.taken < MOST_RESULTS;
         if takes {
@@ -81,22 +80,22 @@ impl Results {
 /// Whether a goal is new to its provider.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Given {
-    /// It is given now.
+    /// The goal is given for the first time.
     Now,
     /// Task control gave it before it was killed, or was about to: it is not given again.
     Before,
-    /// Likewise, and it was told to stop, or was about to be.
+    /// Like `Before`, and it was cancelled, or was about to be.
     ToStop,
 }
 
-/// A goal's way.
+/// A goal that is being performed.
 pub(super) struct Performing {
     pub(super) instance: InstanceId,
     pub(super) attempt: u32,
-    /// It is given when these goals have ended, which were told to stop: each is cancelled then.
+    /// Cancelled goals that have to end first: each token is cancelled when its goal has ended.
     pub(super) before: Vec<CancellationToken>,
     pub(super) endpoint: Result<Endpoint, String>,
-    /// The provider's id: what measures, where it names nothing itself.
+    /// The provider's id: the source of measurements that name none.
     pub(super) source: String,
     pub(super) timeout_s: Option<f64>,
     pub(super) speed: f64,
@@ -107,33 +106,33 @@ pub(super) struct Performing {
     pub(super) stop: CancellationToken,
     pub(super) goal: Goal,
     pub(super) results: Mutex<Results>,
-    /// What a result has to have.
+    /// The output ports that a result must have.
     pub(super) outputs: Vec<String>,
-    /// What has to be safe before it begins.
+    /// What has to be synced to disk before the goal begins.
     pub(super) safe: Option<Mark>,
-    /// Without a projection: the root world, which has to have this commit of the run before it is given.
+    /// For a goal without a projection: the root world has to contain this commit of the run before the goal is given.
     pub(super) sees: Option<(watch::Receiver<Confirmed>, Revision)>,
-    /// The run is over: nothing begins any more.
+    /// The run is over: no goal begins any more.
     pub(super) over: CancellationToken,
     pub(super) told: Told,
 }
 
-/// The deadline that the provider is told, in wall time; 0 for none.
+/// The deadline sent to the provider, in milliseconds of wall time; 0 for none.
 pub(super) fn deadline_ms(timeout_s: Option<f64>, speed: f64) -> u64 {
     let Some(timeout_s) = timeout_s else { return 0 };
-    // A float to an integer saturates.
+    // A conversion from float to integer saturates.
     ((timeout_s / speed * 1e3).ceil() as u64).saturating_add(DEADLINE_SLACK.as_millis() as u64)
 }
 
 impl Performing {
-    /// Until its end; the event goes to the shell, unless the goal was told to stop.
+    /// Performs the goal until its end; sends the event to the shell, unless the goal was cancelled.
     pub(super) async fn perform(mut self, given: Given) {
         if let Some(safe) = self.safe.take() {
             tokio::select! {
                 biased;
                 () = self.stop.cancelled() => return,
                 () = self.over.cancelled() => return,
-                // Where it never will be the run ends.
+                // If it never will be, the run ends.
                 is_safe = safe.safe() => if !is_safe { return },
             }
         }
@@ -145,7 +144,7 @@ impl Performing {
                 () = before.cancelled() => {}
             }
         }
-        // One of before is looked for first.
+        // A goal that was given before is looked for first.
         if given == Given::Now && !self.sees_what_was_decided().await {
             return;
         }
@@ -163,7 +162,7 @@ impl Performing {
         }
     }
 
-    /// Waits until the world that it looks at has what was decided before it; whether it is given then.
+    /// Waits until the root has every earlier decision; returns whether the goal may be given.
     async fn sees_what_was_decided(&self) -> bool {
         let Some((mut confirmed, decided)) = self.sees.clone() else { return true };
         let is_there = async { confirmed.wait_for(|confirmed| confirmed.commit >= decided).await.is_ok() };
@@ -171,12 +170,12 @@ impl Performing {
             biased;
             () = self.stop.cancelled() => false,
             () = self.over.cancelled() => false,
-            // Where it never is the run ends.
+            // If it never has, the run ends.
             is_there = is_there => is_there,
         }
     }
 
-    /// `None` when it was told to stop.
+    /// `None` if the goal was cancelled.
     async fn execute(&self, endpoint: &Endpoint, given: Given) -> Option<Event> {
         let begun = Instant::now();
         let ending = async {
@@ -190,7 +189,7 @@ impl Performing {
         };
         let mut ending = std::pin::pin!(ending);
         let event = tokio::select! {
-            // It is given before it is told to stop.
+            // The goal is given before it is cancelled.
             biased;
             event = &mut ending => event,
             () = self.stop.cancelled() => {
@@ -207,7 +206,8 @@ impl Performing {
         Some(self.in_time(event, begun))
     }
 
-    /// Until it has been heard: a goal and its cancel go different ways, and one that is given again for a while may come after that.
+    /// Repeats the cancel until it is heard: a goal and its cancel travel on different paths, and a goal whose call is being repeated may arrive
+    /// after the cancel.
     async fn tell_to_stop(&self, endpoint: &Endpoint) {
         while match self.actions.cancel(endpoint, &self.goal.id).await {
             Ok(under_way) => !under_way,
@@ -217,7 +217,7 @@ impl Performing {
         }
     }
 
-    /// Resolves when the goal only improves a result that it has given, beside other runs: what others may want is not held for that.
+    /// Resolves when the goal only improves a given result while there are other runs: its resources are not held for that.
     async fn is_in_the_way(&self) {
         if self.goal.improves.is_none() {
             return std::future::pending().await;
@@ -228,8 +228,7 @@ impl Performing {
         }
     }
 
-    /// What most goals do not come to is apart, on the heap, so that the future of a goal is small: it is copied some ten times on its way
-    /// through the runtime.
+    /// Rare branches are boxed, so that the future of a goal is small: it is copied about ten times on its way through the runtime.
     async fn ending(&self, endpoint: &Endpoint, given: Given) -> Event {
         match given {
             Given::Now => self.given(endpoint).await,
@@ -244,7 +243,7 @@ impl Performing {
             }
             Ok(fate) => self.finished(fate.outcome),
             Err(error) if error.is_unreadable() => self.unreadable(endpoint, &error).await,
-            // Task control was killed when it had written down that it gives the goal, and before it did.
+            // Task control was killed after it logged that it gives the goal, and before it gave it.
             Err(error)
                 if error.code() == Some(tonic::Code::NotFound)
                     && self.would_be_known(endpoint).await
@@ -264,18 +263,18 @@ impl Performing {
         let is_wanted = || !self.stop.is_cancelled();
         match self.actions.execute_hearing(endpoint, self.goal.clone(), is_wanted, |said| self.said(said)).await {
             Ok(outcome) => self.finished(outcome),
-            // What was wrong with the goal is wrong with it the next time, too.
+            // A malformed goal will be malformed the next time, too.
             Err(error) if error.code() == Some(tonic::Code::InvalidArgument) => self.aborted(said(&error)),
-            // Nor is what it has answered better the next time.
+            // An unreadable answer will be unreadable the next time, too.
             Err(error) if error.is_unreadable() => Box::pin(self.unreadable(endpoint, &error)).await,
-            // Only the connection may have broken; the goal is still there then.
+            // Perhaps only the connection broke; then the goal is still there.
             Err(error @ CallError::Broken { .. }) => Box::pin(self.attached(endpoint, &error)).await,
             Err(error) => Box::pin(self.lost(endpoint, &error)).await,
         }
     }
 
-    /// Whether a provider that does not know the goal was never given it. It could also be another process since, or have forgotten
-    /// it; but then the session that the resource is bound to would not live on, and under the goal's lease nobody else gives it any.
+    /// Whether a provider that does not know the goal was never given it. It could also be a new process, or have forgotten the goal; but then the
+    /// session of the resource would not live on, and nobody else gives goals under this goal's lease.
     async fn would_be_known(&self, endpoint: &Endpoint) -> bool {
         let Some((lease, provider)) = self.provider(endpoint) else { return false };
         let owner = async || {
@@ -303,8 +302,8 @@ impl Performing {
         Some((lease.id, resource.id.clone()))
     }
 
-    /// What the provider answered cannot be read. Where that is no message at all it may be the answer to another goal of the same stream: over a
-    /// stream of its own this one hears its own.
+    /// The provider's answer cannot be read. If it is not a valid message, it may belong to another goal on the same stream: this goal asks again
+    /// over a separate stream.
     async fn unreadable(&self, endpoint: &Endpoint, unreadable: &CallError) -> Event {
         if !matches!(unreadable, CallError::Malformed { .. }) {
             let attached = self.actions.attach_alone(endpoint, self.goal.clone(), |said| self.said(said));
@@ -313,14 +312,14 @@ impl Performing {
                 Err(broken @ CallError::Broken { .. }) if !broken.is_unreadable() => {
                     return self.lost(endpoint, &broken).await;
                 }
-                // It never came to its provider behind what broke the stream.
+                // The goal never reached its provider, because the stream broke before it.
                 Err(unknown) if unknown.code() == Some(tonic::Code::NotFound) => {
                     return self.lost(endpoint, unreadable).await;
                 }
                 _ => {}
             }
         }
-        // It may be under way still, and whoever comes next has the same resource.
+        // The goal may be under way still, and the next holder gets the same resource.
         let _ = tokio::time::timeout(CANCEL_DEADLINE, self.tell_to_stop(endpoint)).await;
         self.aborted(format!("its worker answered what cannot be read: {}", said(unreadable)))
     }
@@ -345,7 +344,7 @@ impl Performing {
         self.crashed(reason)
     }
 
-    /// How the process of a provider ended, as the process manager of its host says; `None` where none knows.
+    /// How the process of a provider ended, according to the process manager of its host; `None` if unknown.
     async fn end_of(&self, provider: &str) -> Option<String> {
         let host = provider.rsplit_once('@')?.1;
         let asking = async {
@@ -353,14 +352,14 @@ impl Performing {
             let manager = hosts.iter().find(|one| one.host == host)?.endpoint().parse().ok()?;
             let pools = ProcessClient::new(&self.channels, &manager).ok()?.pools().await.ok()?.pools;
             let end = pools.iter().find_map(|pool| pool.last_exit.strip_prefix(&format!("{provider}: ")));
-            // What it wrote at last is in `ratn logs`.
+            // Its last output is in `ratn logs`.
             Some(end?.split("; its last words").next()?.to_owned())
         };
         tokio::time::timeout(END_DEADLINE, asking).await.ok().flatten()
     }
 
-    /// Who tries again at once would be given the same provider again, and nothing would come of any of its attempts: it is over when
-    /// nobody can be given that one any more. Its lease is not given back before.
+    /// Waits until nobody can be granted the failed provider any more: an immediate retry would be granted the same provider again, and all its
+    /// attempts would fail. The lease is not released before.
     async fn withdrawn(&self, endpoint: &Endpoint, error: &CallError) {
         if error.reason() == STILL_RUNNING {
             tokio::select! {
@@ -373,7 +372,7 @@ impl Performing {
         {
             let there = endpoint.to_string();
             let withdrawn = async {
-                // A manager that does not answer may still have it when it is back.
+                // A manager that does not answer may still have the resource when it returns.
                 while match self.resources.get(&provider).await {
                     Ok(resource) => resource.endpoint() == there,
                     Err(error) => error.is_crash(),
@@ -388,7 +387,7 @@ impl Performing {
         }
     }
 
-    /// What the provider ended at its deadline has failed, whatever the provider calls that.
+    /// A goal that the provider ended at its deadline has failed, whatever outcome the provider gives.
     fn in_time(&self, event: Event, begun: Instant) -> Event {
         match (event, self.timeout_s) {
             (Event::Finished { outcome, .. }, Some(timeout_s))
@@ -404,9 +403,9 @@ impl Performing {
         let (instance, attempt) = (self.instance, self.attempt);
         let event = match said {
             Said::Progress { message, .. } => Event::Progressed { instance, attempt, message: one_line(&message) },
-            // What it comes to when it was told to stop nobody waits for.
+            // Nobody waits for the results of a cancelled goal.
             Said::Improved(_) if self.stop.is_cancelled() => return,
-            // What is not whole is no result.
+            // A result with missing outputs is not a result.
             Said::Improved(GoalImproved { outputs, .. })
                 if !self.outputs.iter().all(|port| outputs.contains_key(port)) =>
             {
@@ -420,7 +419,7 @@ impl Performing {
             }
         };
         let sent = self.events.try_send(event.into());
-        // When events pile up, progress can be missed: it is for people. A result cannot, its goal may give no other.
+        // When events pile up, progress can be dropped: it is for people. A result cannot, because the goal may give no other.
         if let Err(TrySendError::Full(Answer::Event { event, withdrawn })) = sent
             && matches!(*event, Event::Improved { .. })
         {
@@ -459,7 +458,7 @@ impl Performing {
         Event::Crashed { instance, attempt, reason, unknown: false }
     }
 
-    /// It may have been done.
+    /// A crash after which it is unknown whether the goal was performed.
     fn unknown(&self, reason: String) -> Event {
         let (instance, attempt, reason) = (self.instance, self.attempt, readable(&reason));
         Event::Crashed { instance, attempt, reason, unknown: true }
@@ -487,7 +486,7 @@ mod tests {
     use tonic::{Code, Request, Response, Status, Streaming};
     use tonic_types::{ErrorDetails, StatusExt};
 
-    /// `work`: is done at once. `hang`: never, unless it is told to stop. `better`: with results before that, not each of which is better.
+    /// `work` ends at once. `hang` never ends unless cancelled. `better` gives intermediate results, not each of which is better.
     struct Named(&'static str);
 
     #[tonic::async_trait]
@@ -605,7 +604,7 @@ mod tests {
     #[tokio::test]
     async fn a_goal_of_before_is_found_and_not_given_again() -> anyhow::Result<()> {
         let mut bench = Bench::new().await?;
-        // Nobody has given it: what became of it is not known, and it is not begun.
+        // The goal was never given: its fate is unknown, and it is not begun.
         bench.performing("work", None, 0).perform(Given::Before).await;
         let event = bench.event().await;
         assert!(
@@ -658,7 +657,7 @@ mod tests {
         let performing = bench.performing("hang", None, 0);
         performing.stop.cancel();
         performing.perform(Given::Now).await;
-        // Nor is one that waits for the disk when the run is over.
+        // Nor is one given that waits for the disk when the run is over.
         let mut performing = bench.performing("hang", None, 0);
         let ((_disk, slow), over) = (Mark::not_yet(), performing.over.clone());
         performing.safe = Some(slow);
@@ -672,7 +671,7 @@ mod tests {
         Ok(())
     }
 
-    /// A provider to which goals come late: it refuses the first for now, and one that it takes is under way a while after that.
+    /// A provider that goals reach late: it refuses the first goal temporarily, and a goal that it accepts is under way a while later.
     struct Late {
         refuses: AtomicU32,
         begun: AtomicU32,
@@ -749,7 +748,7 @@ mod tests {
         Ok(())
     }
 
-    /// A provider that was made elsewhere: this is its answer to every goal.
+    /// A provider in another implementation: this is its answer to every goal.
     struct Elsewhere(Result<GoalResult, Status>);
 
     #[tonic::async_trait]
@@ -866,7 +865,7 @@ mod tests {
         }
         assert!(costs.windows(2).all(|pair| pair[1] < pair[0]), "{costs:?}");
         assert!(costs.len() > 2 && costs.len() <= MOST_RESULTS as usize, "{}", costs.len());
-        // A goal that may not give any ends as it says: that it tried to is an error of the action.
+        // A goal that must not give any ends with its own outcome: the attempt is an error of the action.
         let mut performing = bench.performing("better", None, 0);
         performing.goal.id.push_str("/again");
         performing.perform(Given::Now).await;

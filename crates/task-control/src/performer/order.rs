@@ -1,15 +1,15 @@
-//! What is on its way to the resource manager and has to be there before something else leaves. What the run has used up or deleted is gone for
-//! what comes behind it in the program, and what it gave back just before may be exactly that:
+//! The order of calls to the resource manager: some have to arrive before others are sent. What an operation of the run consumes or deletes is gone
+//! for everything later in the program, and it may be what the run has just released:
 //!
 //! ```text
-//! leases go back ─► an operation ─► what is asked for behind it
+//! releases of leases ─► an operation ─► later requests
 //! ```
 
 use crate::record::Order;
 use crate::safe_on_disk::Mark;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-/// From so many on, those that have their answer are forgotten.
+/// From this number on, answered calls are removed from time to time.
 const FORGETS_FROM: usize = 64;
 
 /// Calls of one kind that have no answer yet.
@@ -17,45 +17,45 @@ const FORGETS_FROM: usize = 64;
 pub(super) struct OnTheWay(Vec<CancellationToken>);
 
 impl OnTheWay {
-    /// One more, until what is returned is dropped.
+    /// Adds a call, which ends when the returned guard is dropped.
     pub(super) fn begin(&mut self) -> DropGuard {
         let over = CancellationToken::new();
         self.add(over.clone());
         over.drop_guard()
     }
 
-    /// What this token stands for is one of them, until it is cancelled.
+    /// Adds a call, which ends when this token is cancelled.
     pub(super) fn add(&mut self, over: CancellationToken) {
-        // Now and then: nobody may ever ask for all of them.
+        // Clean up now and then: `all` may never be called.
         if self.0.len() >= FORGETS_FROM && self.0.len().is_power_of_two() {
             self.0.retain(|over| !over.is_cancelled());
         }
         self.0.push(over);
     }
 
-    /// Each token is cancelled when its call is over.
+    /// The tokens of the open calls; each is cancelled when its call ends.
     pub(super) fn all(&mut self) -> Vec<CancellationToken> {
         self.0.retain(|over| !over.is_cancelled());
         self.0.clone()
     }
 
-    /// Whether there is none.
+    /// Whether there are no open calls.
     pub(super) fn is_empty(&self) -> bool {
         self.0.iter().all(CancellationToken::is_cancelled)
     }
 }
 
-/// Where a run's operations stand among its leases.
+/// The order of a run's operations relative to its leases.
 #[derive(Debug, Default)]
 pub(super) struct Operations {
-    /// Leases that go back, and acquires that are withdrawn: what was granted to these meanwhile goes back, too.
+    /// Releases of leases, and withdrawn acquires, whose grants are released too.
     pub(super) returning: OnTheWay,
-    /// Operations.
+    /// Operations under way.
     pub(super) operating: OnTheWay,
 }
 
 impl Operations {
-    /// The place of the next operation.
+    /// The order of the next operation: it is sent after the releases so far.
     pub(super) fn next(&mut self, safe: Option<Mark>) -> Order {
         Order { safe, after: self.returning.all(), _ends: self.operating.begin() }
     }

@@ -1,9 +1,9 @@
-//! What a run was told of the world, and what it has to be told before it uses a resource that another run had.
+//! Tracks what the world pool has reported to a run, and what it has to report before the run uses a resource that another run had.
 //!
-//! Runs on one system see what each other commits as changes from outside, in the order of the world pool, a moment later. A resource may change
-//! hands within that moment: whoever gives one back leaves word with the resource manager of what it had committed and had been told ([`Left`]), and
-//! whoever gets it next waits until it has been told as much. So runs that hold the same resource one after the other see each other's
-//! doing as one program would. Only where that is late is anybody asked ([`Ask`]).
+//! Runs on one system see each other's commits as changes from outside, in the order of the world pool, with a short delay. A resource may change
+//! hands within that delay. So a run that releases a resource leaves a note with the resource manager about what it had committed and received
+//! ([`Left`]), and the next holder waits until it has received as much. Runs that hold the same resource in turn therefore see each other's effects
+//! as one program would. The pool and the resource manager are asked ([`Ask`]) only if a report is late.
 
 #[cfg(doc)]
 use crate::record::Decided;
@@ -16,25 +16,25 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
-/// Usually everything is told by then; after this it is asked for.
+/// Usually every report has arrived after this time; later, the pool is asked.
 const USUAL: Duration = Duration::from_millis(50);
-/// So often what is not told is asked for again.
+/// Interval at which a missing report is asked for again.
 const AGAIN: Duration = Duration::from_millis(500);
-/// What is not known after this time never will be.
+/// After this time the run stops waiting for an answer.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// A commit of a run that is under way which a pool that answers has not got after so long is not waited for: it will not come, or it was never
-/// made. Longer than what is in front of it in its run is tried ([`crate::decided`]); one that comes later is made only where nobody has changed what it is
-/// made of (`came_between`).
+/// A commit of a running run that has not reached an answering pool after this time is not waited for: it will not come, or was never made. This is
+/// longer than the time for which the calls before it in its run are repeated ([`crate::decided`]); a later commit is made only if nobody has changed
+/// what it is based on (`came_between`).
 pub(super) const PENDING_PATIENCE: Duration = Duration::from_secs(45);
-/// Of so many other runs it is known what was heard; then the one is forgotten of which nothing was heard for longest: who has to know of it asks.
+/// Maximum number of other runs that are remembered; beyond it the run with the oldest report is forgotten, and asked about if needed.
 const MOST_RUNS: usize = 1024;
 
-/// What a run had committed and had been told when it gave a lease back.
+/// The note of a run: what it had committed and received when it released a lease.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Left {
-    /// The revision of the root that it had been told of.
+    /// The newest revision of the root that it had received.
     pub(super) told: Revision,
-    /// Its own number of its last commit, where it had not been told of that; else 0.
+    /// The number of its last commit, if the pool had not reported that commit yet; else 0.
     pub(super) pending: Revision,
 }
 
@@ -54,18 +54,18 @@ impl FromStr for Left {
     }
 }
 
-/// What can be asked where something is not told in time.
+/// What can be asked if a report is late.
 pub(super) trait Ask {
-    /// The revision of the pool's root; `None` where it does not answer.
+    /// The revision of the pool's root; `None` if the pool does not answer.
     async fn root(&self) -> Option<Revision>;
-    /// Whether a run is under way; `None` where nobody knows.
+    /// Whether a run is under way; `None` if unknown.
     async fn is_under_way(&self, run: &str) -> Option<bool>;
 }
 
-/// How far the run was told. Clones share it.
+/// What the run has received from the pool. Clones share it.
 #[derive(Debug, Clone)]
 pub(super) struct Told {
-    /// The run's id.
+    /// The id of this run.
     run: Arc<str>,
     heard: Arc<watch::Sender<Heard>>,
 }
@@ -73,23 +73,23 @@ pub(super) struct Told {
 #[derive(Debug, Default)]
 struct Heard {
     revision: Revision,
-    /// The run's own number of its last commit that it has heard of.
+    /// The number of the run's own last reported commit.
     own: Revision,
-    /// Of other runs: their own numbers of their last commits, and when that was heard, as a number that grows.
+    /// For other runs: the number of their last reported commit, and the serial number of that report.
     runs: BTreeMap<String, (Revision, u64)>,
-    /// The last of those numbers.
+    /// The last serial number.
     hearings: u64,
-    /// Whether another run is under way beside this one, as far as was heard lately.
+    /// Whether another run is under way beside this one, according to the last news.
     has_others: bool,
 }
 
 impl Heard {
-    /// Another run's own number of its last commit.
+    /// The number of another run's last reported commit.
     fn number(&self, run: &str) -> Revision {
         self.runs.get(run).map(|(number, _)| *number).unwrap_or_default()
     }
 
-    /// A run has committed, by its own number.
+    /// Records that a run has committed, by the run's own number.
     fn of(&mut self, own: &str, run: String, number: Revision) {
         if run == own {
             self.own = self.own.max(number);
@@ -109,22 +109,22 @@ impl Heard {
 }
 
 impl Told {
-    /// A run, of nothing yet.
+    /// A run that has received nothing yet.
     pub(super) fn new(run: &str) -> Told {
         Told { run: run.into(), heard: Arc::new(watch::Sender::default()) }
     }
 
-    /// The run's commits up to this one are in the root that was told.
+    /// The run's commits up to this number are contained in the root that was read.
     pub(super) fn committed(&self, number: Revision) {
         self.heard.send_modify(|heard| heard.own = heard.own.max(number));
     }
 
-    /// The root as it was read.
+    /// The root was read at this revision.
     pub(super) fn root(&self, revision: Revision) {
         self.heard.send_modify(|heard| heard.revision = heard.revision.max(revision));
     }
 
-    /// A revision whose event is before everything that is told from now on.
+    /// A revision was reported; its event comes before all later ones.
     pub(super) fn hear(&self, change: Revision, commit: Option<(String, Revision)>) {
         self.heard.send_modify(|heard| {
             heard.revision = heard.revision.max(change);
@@ -134,12 +134,12 @@ impl Told {
         });
     }
 
-    /// The revision that was told last.
+    /// The newest reported revision.
     pub(super) fn revision(&self) -> Revision {
         self.heard.borrow().revision
     }
 
-    /// Another run is under way beside this one, or none is.
+    /// Records whether another run is under way beside this one.
     pub(super) fn beside_others(&self, has_others: bool) {
         self.heard.send_if_modified(|heard| std::mem::replace(&mut heard.has_others, has_others) != has_others);
     }
@@ -149,27 +149,27 @@ impl Told {
         self.heard.borrow().has_others
     }
 
-    /// Waits for so long, and until another run is known of.
+    /// Waits for this time, and until another run is known.
     pub(super) async fn others_after(&self, time: Duration) {
         tokio::time::sleep(time).await;
         let mut heard = self.heard.subscribe();
-        // Whoever could tell of it is this.
+        // The sender is `self`.
         let _ = heard.wait_for(|heard| heard.has_others).await;
     }
 
-    /// What the run leaves whose last commit is its own number `decided`.
+    /// The note of this run if its last commit has the number `decided`.
     pub(super) fn left(&self, decided: Revision) -> Left {
         let heard = self.heard.borrow();
         let pending = if heard.own >= decided { Revision::default() } else { decided };
         Left { told: heard.revision, pending }
     }
 
-    /// Waits until everything is told that these notes of others speak of. What a run had on its way that is not under way any more is in the pool,
-    /// or never will be. A note is a claim of whoever left it: where the pool answers it can delay, by [`PENDING_PATIENCE`] at the most, and not refuse;
-    /// and what a run claimed in vain is not waited for again.
+    /// Waits until everything that these notes of others mention has been reported. What an ended run had not committed yet is in the pool, or never
+    /// will be. A note is only a claim of its author: if the pool answers, it can delay the run by at most [`PENDING_PATIENCE`], but not block it; a
+    /// false claim of a run is not waited for again.
     ///
     /// # Errors
-    /// Where the pool, or the resource manager, has not said after [`PATIENCE`] what there is: the resources are not to be used.
+    /// The pool, or the resource manager, has not answered after [`PATIENCE`]: the resources must not be used.
     pub(super) async fn until(&self, notes: &[HolderNote], ask: &impl Ask) -> Result<(), String> {
         self.until_claimed(notes, ask, PENDING_PATIENCE).await
     }
@@ -200,11 +200,11 @@ impl Told {
                         tracing::warn!(run, %pending, "what it left word of was not committed in time, and is not waited for any more");
                         self.hear(Revision::default(), Some((run, pending)));
                     }
-                    // What it had made until then.
+                    // What the run had committed until then.
                     *left = Left { told: root, pending: Revision::default() };
                 }
             }
-            // Nobody was told more than there is.
+            // A run cannot have received more than the pool has.
             match ask.root().await {
                 Some(root) => {
                     pool_answers.get_or_insert_with(Instant::now);
@@ -224,12 +224,12 @@ impl Told {
         ))
     }
 
-    /// Whether a commit of another run was heard of, by that run's number.
+    /// Whether a commit of another run was reported, by that run's number.
     fn has_heard(&self, run: &str, number: Revision) -> bool {
         self.heard.borrow().number(run) >= number
     }
 
-    /// Whether all of it is told, within this time.
+    /// Whether everything is reported within this time.
     async fn is_told(&self, others: &[(&str, Left)], within: Duration) -> bool {
         let is_told = |heard: &Heard| {
             others.iter().all(|(run, left)| heard.revision >= left.told && heard.number(run) >= left.pending)
@@ -239,7 +239,7 @@ impl Told {
     }
 }
 
-/// The run that made a commit, and its own number of it, as [`Decided::id`] says them.
+/// The run that made a commit, and the run's number of it, from the commit id ([`Decided::id`]).
 pub(super) fn maker(commit: &str) -> Option<(String, Revision)> {
     let (instance, number) = commit.rsplit_once('/')?;
     let (run, _) = instance.rsplit_once('/')?;
@@ -254,7 +254,7 @@ mod tests {
     use crate::record::Decided;
     use ratn_model::id::InstanceId;
 
-    /// A pool that is at a revision, or does not answer, and a run that is under way or not.
+    /// A pool at a revision, or one that does not answer, and a run that is under way or not.
     struct Known(Option<u64>, bool);
 
     impl Ask for Known {
@@ -320,9 +320,9 @@ mod tests {
         assert_eq!(told.until_claimed(&[note(u64::MAX)], &known, patience).await, Ok(()));
         let took = began.elapsed();
         assert!(patience <= took && took < patience + Duration::from_secs(3), "{took:?}");
-        // Nor is it believed again.
+        // Nor does a second claim of the liar cause a wait.
         assert!(!waits_knowing(&told, "liar", "0 7", Known(Some(5), true)).await);
-        // A pool that does not answer does not say that it has not got it.
+        // A pool that does not answer does not say that it lacks the commit.
         let told = Told::new("run-a");
         let (notes, silent) = ([note(7)], Known(None, true));
         let silent = told.until_claimed(&notes, &silent, patience);

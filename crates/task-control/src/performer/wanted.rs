@@ -1,4 +1,4 @@
-//! What other runs wait for and need for certain, and this run holds: its executive hears of it, and gives up what is only speculative.
+//! Watches what other runs certainly need and this run holds: its executive is told, and releases what is only speculative.
 
 use super::Answer;
 use super::told::Told;
@@ -12,13 +12,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
 
-/// So often the queue of the resource manager is looked at, beside other runs and while anything is held in case it is needed.
+/// Interval between reads of the resource manager's queue, while there are other runs and this run holds something speculatively.
 const LOOK_AGAIN: Duration = Duration::from_millis(250);
 
-/// Who still waits so long after it was told of is told of again: what was given up for it has come back by then, and was not enough.
+/// A request that still waits this long after it was reported is reported again: what was given up for it has been released by then, and was not enough.
 const TELL_AGAIN: Duration = Duration::from_secs(3);
 
-/// Whether a run holds anything in case it is needed. Clones share it.
+/// Whether a run holds anything speculatively. Clones share it.
 #[derive(Debug, Clone, Default)]
 pub(super) struct HoldsSpeculatively(Arc<AtomicBool>);
 
@@ -32,12 +32,12 @@ impl HoldsSpeculatively {
     }
 }
 
-/// Who was told of, by request.
+/// The requests that were reported, with the time.
 #[derive(Debug, Default)]
 struct ToldOf(BTreeMap<String, Instant>);
 
 impl ToldOf {
-    /// The leases in the way of each that is to be told of now.
+    /// For each request that is to be reported now, the leases that block it.
     fn of(&mut self, run: &str, waiting: Vec<WaitingAcquire>, now: Instant) -> Vec<Vec<LeaseId>> {
         self.0.retain(|_, told| now.duration_since(*told) < TELL_AGAIN);
         let certain = waiting.into_iter().filter(|one| one.priority >= CERTAIN && one.session != run);
@@ -48,7 +48,7 @@ impl ToldOf {
     }
 }
 
-/// Looks while other runs are known of; ends with the run.
+/// Watches while other runs are known; ends with the run.
 pub(super) async fn listen(
     resources: ResourceClient,
     run: String,
@@ -62,7 +62,7 @@ pub(super) async fn listen(
         if !holds.get() {
             continue;
         }
-        // The most urgent come first, so those are among the hundred that are told.
+        // The most urgent requests come first, so they are among the at most one hundred in the answer.
         let Ok(waiting) = resources.explain("").await else { continue };
         for leases in told_of.of(&run, waiting, Instant::now()) {
             if events.send(Answer::Wanted(leases)).await.is_err() {

@@ -1,4 +1,4 @@
-//! What the world pool tells of its root while a run is under way.
+//! Watches the root of the world pool while a run is under way.
 
 use super::Answer;
 use super::told::{Told, maker};
@@ -10,11 +10,11 @@ use ratn_worker::client::{CallError, WorldClient};
 use ratn_worker::client::{PAUSE, retry_unanswered};
 use tokio::sync::mpsc;
 
-/// So many revisions before the run are looked at, for whose they are: a resource may be given on by who made one of them.
+/// This many revisions before the run are read, to learn which runs made them: one of these runs may hand a resource over.
 const LOOK_BACK: u64 = 256;
 
-/// Tells of every revision after one, in order and without a gap, as long as somebody listens. A pool that comes back with its
-/// state is heard again where it was; with one that has lost it the run cannot go on.
+/// Reports every revision after `after`, in order and without gaps, as long as somebody receives. The watch of a pool that returns with its state is
+/// continued; if the pool has lost its state, the run cannot go on.
 pub(super) async fn follow(world: WorldClient, after: Revision, events: mpsc::Sender<Answer>, heard: Told) {
     let mut from = Revision(after.0.saturating_sub(LOOK_BACK));
     loop {
@@ -23,10 +23,10 @@ pub(super) async fn follow(world: WorldClient, after: Revision, events: mpsc::Se
             return;
         }
         match told {
-            // The watch ended with its pool, which may come back.
+            // The watch ended with its pool, which may return.
             Ok(()) => {}
             Err(error) if error.is_crash() => {}
-            // The pool does not keep what was so long ago.
+            // The pool's history does not reach back that far.
             Err(_) if from < after => {
                 from = after;
                 continue;

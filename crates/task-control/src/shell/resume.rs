@@ -1,5 +1,4 @@
-//! Going on with a run from its event log: the executive is brought to where it was, what was open is taken up, and the loop goes
-//! on as ever.
+//! Resumes a run from its event log: the executive is restored, open items are continued, and the loop goes on as usual.
 
 use super::{Ended, LOOK, Place, Shell, advisor_of, syncer_of, unix_ms};
 use crate::alarm::Alarm;
@@ -23,7 +22,7 @@ use std::sync::Arc;
 use std::time::Instant;
 use tokio::sync::mpsc;
 
-/// A run to go on with, as its log has it.
+/// A run to resume, as described by its log.
 pub struct Resumption {
     program: Arc<Program>,
     history: History,
@@ -33,10 +32,10 @@ pub struct Resumption {
 }
 
 impl Resumption {
-    /// Replays what the log says. Touches nothing of the run.
+    /// Replays the log. Changes nothing of the run.
     ///
     /// # Errors
-    /// Where the log is not of this program and this version.
+    /// The log does not match this program or this version.
     pub fn new(
         program: Program,
         history: History,
@@ -48,12 +47,12 @@ impl Resumption {
         Ok(Resumption::of(program, history, replayed, log, checkpoint_every))
     }
 
-    /// The share that the run had last of what several runs need, where the log says one.
+    /// The last share of the run, if the log has one.
     pub fn share(&self) -> Option<f64> {
         self.replayed.standing.ledger.origin.share
     }
 
-    /// The same from the whole log, where its checkpoint does not know enough.
+    /// The same from the whole log, if the checkpoint is not sufficient.
     fn whole(self) -> Result<Resumption, HistoryError> {
         let Resumption { program, history, log, checkpoint_every, .. } = self;
         let replayed = history.replay_whole(&program)?;
@@ -77,12 +76,12 @@ impl Resumption {
     }
 }
 
-/// Goes on with a run whose task control was killed, on the system that it was on. Of one that has ended it does what may not have been done when it
-/// was killed.
+/// Resumes a run whose task control was killed, on the same system. For a run that has ended, performs the decisions that may not have been performed
+/// when it was killed.
 ///
 /// # Errors
-/// As when a run begins; and where the run cannot go on: its log is of another program, its world is not there any more, it is under
-/// way. [`ReplayError::Ended`] where it has ended and nothing is left to do.
+/// As when a run begins; also if the run cannot be resumed: its log belongs to another program, its world does not exist any more, or it is under
+/// way. [`ReplayError::Ended`] if it has ended and nothing is left to do.
 pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
     let ledger = &resumption.replayed.standing.ledger;
     if resumption.replayed.ended.is_none() {
@@ -99,15 +98,15 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
     let Replayed { executive, standing, missing, events: replayed, .. } = replayed;
     let ReplayedState { mut ledger, states, progress } = standing;
     let (mode, seed) = history.mode_and_seed();
-    // It knows of what is missing before that is written: nothing is kept until it is.
+    // The checkpointer's ledger has the missing commands before they are logged: no checkpoint is made until they are.
     let mut kept = ledger.clone();
     let others = missing.iter().filter(|command| !replay::is_recorded(command));
     others.for_each(|command| kept.command(command));
     let checkpointer = Checkpointer::start(&log, &program.digest, checkpoint_every, kept, replayed);
     let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
-    // One that is refused takes no ear away from the run that listens.
+    // A refused resumption does not replace the control socket of a run that is under way.
     let origin = &ledger.origin;
-    // Of the same trace as before.
+    // The trace is the same as before.
     let trace = trace_of(&origin.run, &program.name, seed, origin.began_unix_ms);
     let before = Some(ledger.session);
     let performer = Performer::connect(place, &origin.run, &program, before, trace, events).await;
@@ -142,7 +141,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         shell.log.append_commands(ledger.last, &missing)?;
         let before = Before { log: shell.log.path().to_owned(), bytes: shell.log.written(), last: ledger.last };
         shell.spans = Spans::of_a_run_that_goes_on(before, shell.clock.now(), place.speed, &place.messages);
-        // What is due is decided on the world as it is: it has become so before anybody is there again.
+        // Timed decisions are made on the present world: it changed while task control was away.
         let (mut mirror, mut commands) = (shell.executive.root().clone(), Vec::new());
         if let Some((revision, facts)) = shell.performer.changed_meanwhile(&ledger, &mirror).await? {
             mirror.overwrite(facts.iter().cloned());
@@ -150,7 +149,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
             commands = shell.decide_at(ledger.last, &changed)?;
             ledger.event(ledger.last, &changed);
         }
-        // Request ids of now on have the number of this resumption: it is in the log before they are used.
+        // Later request ids contain the number of this resumption: it is logged before they are used.
         let resumed = Event::Resumed { share: another_share(&ledger, place.standing) };
         let (mut now, more) = shell.decide(&resumed)?;
         commands.extend(more);
@@ -158,7 +157,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         shell.hand_over()?;
         let lost = shell.performer.session_lost(&ledger).await?;
         if let Some(lost) = &lost {
-            // Time has passed: what was due meanwhile leads to commands, too.
+            // Time has passed: what was due in the meantime causes commands, too.
             let (later, more) = shell.decide(lost)?;
             ledger.event(later, lost);
             now = later;
@@ -168,7 +167,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         shell.log.make_durable()?;
         shell.performer.know(shell.progress.paths());
         let told = shell.performer.take_up(&Arc::clone(&shell.program), ledger, &mirror, now).await?;
-        // What is recorded was taken up with the ledger.
+        // Recorded commands were taken from the ledger.
         let missing = missing.into_iter().filter(|command| !replay::is_recorded(command));
         let mut ended = shell.perform(now, missing.chain(commands), None)?;
         for event in told {
@@ -181,13 +180,13 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
     Box::pin(shell.run_to_its_end(begin, interrupt)).await
 }
 
-/// The share of a run that goes on, where it has another one than before.
+/// The share of a resumed run, if it differs from the previous one.
 fn another_share(ledger: &Ledger, standing: Standing) -> Option<f64> {
     let before = ledger.origin.share.unwrap_or(Standing::default().share);
     (standing.share != before).then_some(standing.share)
 }
 
-/// Does what a run had decided that was killed behind its end.
+/// Performs the remaining decisions of a run that was killed after its end.
 async fn finish(resumption: Resumption, ended: Ended, place: &Place) -> anyhow::Result<Ended> {
     let Resumption { program, history, replayed, mut log, .. } = resumption;
     let mut ledger = replayed.standing.ledger;
@@ -204,7 +203,7 @@ async fn finish(resumption: Resumption, ended: Ended, place: &Place) -> anyhow::
     }
     let (origin, seed) = (&ledger.origin, history.mode_and_seed().1);
     let trace = trace_of(&origin.run, &program.name, seed, origin.began_unix_ms);
-    // Nobody hears of anything any more.
+    // There is no receiver of events any more.
     let events = mpsc::channel(1).0;
     let performer = Performer::connect(place, &origin.run, &program, Some(ledger.session), trace, events).await;
     let mut performer = performer.context("cannot do what the run had decided")?;

@@ -1,4 +1,4 @@
-//! Task control with a real resource manager and world pool, and nobody who would do anything.
+//! Task control with a real resource manager and world pool, without any providers.
 
 use super::*;
 use crate::task_for_tests::{FETCH_BOXES, program};
@@ -117,7 +117,7 @@ states:
   - later: { wait: { signal: later } }
 ";
 
-/// Sends a message as soon as somebody listens; what becomes of it.
+/// Sends a message as soon as a run listens; returns the answer.
 async fn sent(place: &Place, message: Message) -> Result<String, String> {
     loop {
         match crate::control::send(&place.directory, &message).await {
@@ -135,7 +135,7 @@ fn answer(run: &str, state: Option<&str>, choice: &str) -> Message {
     Message::Answer { run: run.to_owned(), state: state.map(str::to_owned), choice: choice.to_owned() }
 }
 
-/// Whether the run says that this state waits.
+/// Waits until the run reports that this state waits.
 async fn waits(place: &Place, path: &str) {
     let is_it = |status: &RunStatus| status.awaits.iter().any(|awaiting| awaiting.path == path);
     while !crate::control::status(&place.directory, ANY_RUN).await.ok().flatten().is_some_and(|status| is_it(&status)) {
@@ -143,7 +143,7 @@ async fn waits(place: &Place, path: &str) {
     }
 }
 
-/// A client of gRPC sees what is waited for, and is refused as everybody.
+/// A gRPC client sees the waits, and is refused like everybody.
 async fn over_grpc(place: &Place) {
     use ratn_proto::v1;
     let runtime = RuntimeDirectory::at(&place.directory);
@@ -179,7 +179,7 @@ async fn over_grpc(place: &Place) {
     assert_eq!(said, "it is kept for the next state that waits for `later`");
 }
 
-/// A client of gRPC sets breakpoints, sees them, and takes them away.
+/// A gRPC client sets, lists and removes breakpoints.
 async fn breakpoints_over_grpc(place: &Place) {
     use ratn_proto::v1;
     let runtime = RuntimeDirectory::at(&place.directory);
@@ -272,7 +272,7 @@ states:
 }
 
 async fn resumption_of(run: &Run) -> anyhow::Result<Resumption> {
-    // Threads of what was dropped hold the log a moment longer.
+    // Threads of dropped runs hold the log a moment longer.
     let log = loop {
         match LogWriter::go_on(&run.log) {
             Err(ratn_event_log::LogError::UnderWay { .. }) => tokio::task::yield_now().await,
@@ -297,7 +297,7 @@ states:
     let nothing = Box::pin(resume(resumption_of(&bench.run).await?, place, &interrupt)).await;
     let ended = || replay::ReplayError::Ended { outcome: outcome.clone() };
     assert_eq!(nothing.err().and_then(|error| error.downcast().ok()), Some(ended()));
-    // A world pool to which its last commit has not come.
+    // A world pool that has not received the last commit.
     let runtime = RuntimeDirectory::create(bench.directory.path().join("other"))?;
     let shutdown = CancellationToken::new();
     tokio::spawn(world_pool::run(WorldPoolConfig::default(), runtime.clone(), shutdown.clone()));
@@ -349,7 +349,7 @@ states:
     let resources = ratn_worker::client::ResourceClient::new(&channels, &place.endpoints.resource_manager, "")?;
     let goes_on = async {
         sent(place, signal("go", Value::Null)).await.expect("it waits");
-        // What is behind it is done behind it.
+        // What comes after the operation is done after it.
         while resources.list(&["Done"]).await.is_ok_and(|there| there.is_empty()) {
             tokio::task::yield_now().await;
         }
@@ -377,14 +377,14 @@ states:
         ended = run(bench.run.clone(), &bench.place, &interrupt) => panic!("it ended: {ended:?}"),
         () = waits(&bench.place, "first") => {}
     }
-    // A resource manager that has never heard of its session.
+    // A resource manager that does not know the session.
     let runtime = RuntimeDirectory::create(bench.directory.path().join("other"))?;
     let shutdown = CancellationToken::new();
     tokio::spawn(resource_manager::run(ResourceManagerConfig::default(), runtime.clone(), shutdown.clone()));
     let _shutdown = shutdown.drop_guard();
     let resource_manager = runtime.wait_for(resource_manager::ROLE, READY).await?;
     let endpoints = Endpoints { resource_manager, ..bench.place.endpoints.clone() };
-    // While the world pool is asked what it has of the run, many of these seconds pass.
+    // While the world pool is asked for the run's commits, many seconds of the robot's time pass.
     let place = &Place { endpoints, speed: 1e5, ..bench.place.clone() };
     let resumed = Box::pin(resume(resumption_of(&bench.run).await?, place, &interrupt));
     let resumed = tokio::time::timeout(READY, resumed).await;
@@ -425,7 +425,7 @@ states:
     let world = ratn_worker::client::WorldClient::new(&channels, &bench.place.endpoints.world_pool)?;
     let fact = FactKey { predicate: "open".to_owned(), arguments: vec![Term::Name("door".to_owned())] };
     world.commit("other/i1/1", vec![Change::Set { fact, value: Value::Bool(true) }], None).await?;
-    // The time of the wait is over by far when somebody is there again.
+    // The deadline of the wait has passed long before the run is resumed.
     let place = &Place { speed: 1e6, ..bench.place.clone() };
     let ended = Box::pin(resume(resumption_of(&bench.run).await?, place, &interrupt)).await?;
     let (lines, now) = (bench.lines()?, Timestamp::from_seconds(300.0));

@@ -1,4 +1,4 @@
-//! The calls that wait in the queue, and what is undone where one was dropped.
+//! Waiting calls, and how the effects of a dropped call are undone.
 
 use super::{ResourceCore, ResourceTurn, Said};
 use crate::resource_manager::Granted;
@@ -14,7 +14,7 @@ impl ResourceCore {
         calls.retain(|(other, _)| *other != ticket);
         if calls.is_empty() {
             self.calls.remove(&waiter);
-            // Unknown when it was answered in this moment: then the answer could not be delivered and was undone.
+            // Unknown if it was answered just now: then the answer could not be delivered and was undone.
             let _ = self.pool.cancel(context.now(), waiter);
         }
     }
@@ -25,12 +25,12 @@ impl ResourceCore {
             return;
         }
         tracing::debug!(%lease, "granted to a call that was dropped: taken back");
-        // Unknown when it has ended meanwhile.
+        // Unknown if the lease has ended since.
         let _ = self.pool.undo_grant(context.now(), lease);
     }
 
-    /// A repeated request is told the lease that it was granted before. Its first call may be dropped without having been read: the
-    /// lease stays for whoever reads this answer.
+    /// Answers a repeated request with the lease that it was granted before. Its first call may be dropped unread: the lease stays for the reader of
+    /// this answer.
     pub(super) fn grant_again(
         &mut self,
         ticket: u64,
@@ -51,7 +51,7 @@ impl ResourceCore {
         }
     }
 
-    /// How many calls took it.
+    /// Answers a waiter's calls; returns how many took the answer.
     pub(super) fn answer(&mut self, waiter: WaiterId, granted: Granted) -> usize {
         let mut taken = 0;
         for (ticket, call) in self.calls.remove(&waiter).unwrap_or_default() {

@@ -26,7 +26,7 @@ impl ResourceCore {
         })
     }
 
-    /// Of a kind that a provider is asked for there are at most so many; an empty reason takes that back.
+    /// A provider reports that it can provide at most `most` of a kind; an empty reason withdraws the report.
     pub(super) fn report_shortage(
         &mut self,
         now: Timestamp,
@@ -46,7 +46,7 @@ impl ResourceCore {
         Ok(())
     }
 
-    /// Tells providers what is missing or waited for, where that may have changed.
+    /// Tells providers what is missing or waited for, if that may have changed.
     pub(super) fn spread_demand(&mut self, context: &ResourceTurn) {
         if let Some(demand) = self.pool.take_demand(self.providers.provided()) {
             self.demand = demand;

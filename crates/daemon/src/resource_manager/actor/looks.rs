@@ -9,12 +9,12 @@ use ratn_resources::{Explanation, WaiterId};
 use std::sync::Arc;
 use tonic::{Code, Status};
 
-/// Waiters that are explained together at the most.
+/// Maximum number of waiters that are explained together.
 const EXPLAINED: usize = 100;
 
-/// Looks at resources and waiters for explanations in one turn.
+/// Maximum number of resources and waiters read for explanations in one turn.
 const LOOKS: usize = 20_000;
-/// What the sessions that are told of in one turn have beside them (leases, waiters, resources), together.
+/// Maximum total number of leases, waiters and resources of the sessions listed in one turn.
 const LISTED_AT_ONCE: usize = 4_096;
 
 impl ResourceCore {

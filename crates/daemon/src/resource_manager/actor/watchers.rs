@@ -1,4 +1,4 @@
-//! The beginning of a watch: everything as it is, or all events after a known position.
+//! The beginning of a watch: a snapshot, or all events after a known position.
 
 use super::{ResourceCore, ResourceTurn};
 use crate::resource_manager::status;
@@ -25,7 +25,7 @@ impl ResourceCore {
                 vec![WatchMessage::Snapshot { revision, resources, youngest }]
             }
             Some(after) => {
-                // Some of this revision may have been seen.
+                // Some events of this revision may have been received.
                 let before = Revision(after.revision.0.saturating_sub(u64::from(after.part.is_some())));
                 let events = self.pool.changes_after(before).map_err(|compacted| status::of_compacted(&compacted))?;
                 events.into_iter().map(WatchMessage::Event).filter(|told| told.concerns(&filter)).collect()

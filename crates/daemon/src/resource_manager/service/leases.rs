@@ -12,10 +12,10 @@ use ratn_resources::{Reply, Request};
 use std::time::Instant;
 use tonic::{Code, Status};
 
-/// What a note may have, in bytes.
+/// Maximum length of a note, in bytes.
 const MAX_NOTE_BYTES: usize = 256;
 
-/// Whether this is one that the next holder may be told.
+/// Checks a note for the next holder.
 fn note(text: &str) -> Result<(), Status> {
     label(text, "note")?;
     if text.len() > MAX_NOTE_BYTES {
@@ -34,7 +34,7 @@ pub(super) async fn release(
     note(&request.note)?;
     let session = optional_session(&request.session_id)?;
     let lease = LeaseId(request.lease_id);
-    // Before: whoever gets its resources in the same turn is told already.
+    // First, because the next holder may get the resources, and read the note, in the same turn.
     let left = notes.left(lease, &request.session_id, &caller.name, &request.note, Instant::now());
     let performed = requests.perform(caller, request.request_id, Request::Release { session, lease }).await;
     if performed.is_err() {

@@ -11,7 +11,7 @@ use ratn_resources::{Reply, Request, SessionId, Speaker};
 use std::sync::Arc;
 use tonic::{Code, Status};
 
-/// The way to the actor; clones share the actor.
+/// Sends requests to the actor; clones share the actor.
 #[derive(Debug, Clone)]
 pub(super) struct Requests {
     actor: Handle,
@@ -23,7 +23,7 @@ impl Requests {
         Requests { actor, metrics }
     }
 
-    /// For what changes nothing, and for calls that wait.
+    /// For reads, and for calls that wait.
     pub(super) fn actor(&self) -> &Handle {
         &self.actor
     }
@@ -32,7 +32,7 @@ impl Requests {
         &self.metrics
     }
 
-    /// A refusal is counted by its reason.
+    /// Counts a refusal by its reason.
     pub(super) fn counted<T>(&self, operation: &'static str, outcome: Result<T, Status>) -> Result<T, Status> {
         outcome.inspect_err(|status| self.metrics.refused(operation, details::reason(status)))
     }
@@ -74,7 +74,7 @@ impl Requests {
             let (speaker, request_id, request) = (speaker.clone(), request_id.clone(), request.clone());
             let message = |answer| Message::Perform { speaker, request_id, request, answer };
             match self.actor.request(message).await {
-                // Some of what the call asks for is done. It asks for the rest, behind those who asked meanwhile.
+                // The call is done in part. It asks for the rest, after those who asked in the meantime.
                 Ok((Reply::Unfinished, _)) => {}
                 changed => break changed,
             }
@@ -90,7 +90,7 @@ pub(super) fn session(id: &str) -> Result<SessionId, Status> {
     Ok(SessionId::from(id))
 }
 
-/// Without a session a call speaks for the operator.
+/// A call without a session is made as operator.
 pub(super) fn optional_session(id: &str) -> Result<Option<SessionId>, Status> {
     (!id.is_empty()).then(|| session(id)).transpose()
 }

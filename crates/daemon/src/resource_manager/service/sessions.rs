@@ -15,9 +15,9 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tonic::{Status, Streaming};
 
-/// Answers that wait for a slow reader of a keep-alive stream.
+/// Maximum number of answers that wait for a slow reader of a keep-alive stream.
 const KEEP_ALIVE_BUFFER: usize = 16;
-/// What a ping on a stream counts as.
+/// The method as which a ping on a stream counts.
 const PING: &str = "/ratn.v1.ResourceService/KeepAlive";
 
 pub(super) async fn kept_alive(
@@ -32,7 +32,7 @@ pub(super) async fn kept_alive(
     let ttl = Duration::from_millis(ping.ttl_ms);
     let (named, id) = (client.clone(), ping.session_id.clone());
     let kept = requests.actor().keep_alive(speaker(caller), session, client, ttl, claim).await;
-    // Pings that change nothing are not written down.
+    // Pings that change nothing are not logged.
     if ttl.is_zero() {
         audit::begin(caller, "", || Mutation::CloseSession { session: id }).ended(&kept);
     } else if kept.as_ref().map_or(true, |kept| kept.created) {
@@ -49,7 +49,7 @@ pub(super) async fn kept_alive(
     })
 }
 
-/// The share that a session says; 0 is none that it says.
+/// The share in a ping; 0 means none.
 fn share(said: f64) -> Result<Share, Malformed> {
     if said == 0.0 {
         return Ok(Share::ONE);
@@ -150,7 +150,7 @@ mod tests {
         for waits in [&mut opened, &mut changed] {
             assert!(futures::poll!(&mut *waits).is_pending());
         }
-        // Behind the two: it waits for the disk as they do, for the session is not on it as it is now.
+        // A ping after these two waits for the disk as they do, because the session's present state is not on disk.
         let mut behind = Box::pin(ping("a", 30));
         assert!(futures::poll!(&mut behind).is_pending());
         assert!(!ping("c", 60).await.created, "the actor has taken all of them by now");

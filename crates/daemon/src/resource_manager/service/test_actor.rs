@@ -10,7 +10,7 @@ use std::sync::Arc;
 use tempfile::TempDir;
 use tokio::sync::watch;
 
-/// An actor whose log is in the directory; the log may be changed before it is opened.
+/// Starts an actor whose log is in the directory; `change` may modify the log before it is opened.
 pub(super) fn started(change: impl FnOnce(Log) -> Log) -> (Handle, TempDir) {
     let (config, directory) = (ResourceManagerConfig::default(), tempfile::tempdir().unwrap());
     let log = change(Journal::log(&config.storage, directory.path()));

@@ -1,4 +1,4 @@
-//! A call that waits for a lease. Its client may drop the call at any time: a lease that was granted to it meanwhile goes back to the pool.
+//! A call that waits for a lease. Its client may drop the call at any time: a lease granted to it in the meantime returns to the pool.
 
 use crate::details::{ending, status};
 use crate::resource_manager::Granted;
@@ -10,16 +10,16 @@ use std::time::Duration;
 use tokio::sync::oneshot;
 use tonic::{Code, Status};
 
-/// What the pool's own answer at a deadline is given to arrive.
+/// Additional time for the pool's own answer at a deadline to arrive.
 const GRACE: Duration = Duration::from_millis(20);
 
-/// The numbers of the calls that wait; clones count on together.
+/// The numbers of waiting calls; clones share the counter.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Tickets {
     next: Arc<AtomicU64>,
 }
 
-/// An acquire that waits. Dropped before its answer, it leaves the queue, or gives back what it was granted meanwhile.
+/// A waiting acquire. Dropped before its answer, it leaves the queue, or returns what it was granted in the meantime.
 pub(super) struct WaitingCall {
     actor: Handle,
     ticket: u64,
@@ -42,11 +42,11 @@ impl WaitingCall {
         Ok(WaitingCall { actor: actor.clone(), ticket, answered: Some(answered) })
     }
 
-    /// Waits for the answer, and a little longer than `wait` for the pool to say what was waited for.
+    /// Waits for the answer, a little longer than `wait`, so that the pool can say what was waited for.
     pub(super) async fn granted(mut self, wait: Duration) -> Granted {
         let Some(answered) = &mut self.answered else { return Err(ending()) };
-        // The pool answers at the deadline, and says what was waited for; a call that joined another of its request id has
-        // a deadline of its own, and leaves by being dropped.
+        // The pool answers at the deadline, and says what was waited for; a call that joined another one with its request id has its own deadline,
+        // and leaves by being dropped.
         let Ok(granted) = tokio::time::timeout(wait + GRACE, answered).await else {
             return Err(status(Code::DeadlineExceeded, "NOT_GRANTED_IN_TIME", "not granted: the deadline has passed"));
         };
@@ -106,7 +106,7 @@ mod tests {
         }
     }
 
-    /// An actor with one arm that is free, and a session.
+    /// An actor with one free arm, and a session.
     async fn with_an_arm() -> (Handle, SessionId, tempfile::TempDir) {
         let (actor, directory) = test_actor::started(|log| log);
         let session = SessionId::from("s");
@@ -124,7 +124,7 @@ mod tests {
         (actor, session, directory)
     }
 
-    /// Always the same request. One that does not wait is dropped before it is answered.
+    /// The same request each time. If it does not wait, it is dropped before it is answered.
     async fn call(actor: &Handle, session: &SessionId, ticket: u64, waits: bool) -> WaitingCall {
         let (answer, answered) = oneshot::channel();
         let answered = waits.then_some(answered);
@@ -149,7 +149,7 @@ mod tests {
         let first = call(&actor, &session, 1, true).await;
         let mut second = call(&actor, &session, 2, true).await;
         let third = call(&actor, &session, 3, true).await;
-        // Read by its client, as the service does it.
+        // Read by its client, as by the service.
         second.answered.take().unwrap().await.unwrap().unwrap();
         for unread in [first, third] {
             drop(unread);

@@ -1,4 +1,4 @@
-//! Watches of resources: a snapshot in messages that are not too large, then the changes, until the watcher is too slow.
+//! Watches of resources: a snapshot in messages of limited size, then the changes, until the watcher is too slow.
 
 use super::Streamed;
 use super::requests::Requests;
@@ -23,9 +23,9 @@ use std::time::{Duration, Instant};
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Status};
 
-/// Resources that one watch may name.
+/// Maximum number of resources that one watch may name.
 const MAX_WATCHED: usize = 1_024;
-/// When a watcher that was cut off may come back.
+/// After this time a disconnected watcher may return.
 const WATCH_AGAIN_AFTER: Duration = Duration::from_millis(50);
 
 pub(super) async fn watch(
@@ -57,16 +57,16 @@ pub(super) async fn watch(
     Ok(watch_stream::ended(updates, shutdown, cut_off))
 }
 
-/// Who watches, for what it has not read yet.
+/// The watching client, which pays quota for unread data.
 #[derive(Debug)]
 pub(super) struct Reader {
     pub(super) caller: Caller,
-    /// None where the server has no quotas.
+    /// `None` if the server has no quotas.
     pub(super) quotas: Option<Quotas>,
 }
 
 impl Reader {
-    /// A snapshot is kept for it until it has read all of it.
+    /// Counts a snapshot that is kept until the client has read it.
     fn keep(&self, resources: &[ResourceView]) -> Result<Option<Permit>, Status> {
         let holders: usize = resources.iter().map(|view| view.holders.live().count()).sum();
         let bytes = std::mem::size_of_val(resources) + holders * size_of::<Holding>();
@@ -77,7 +77,7 @@ impl Reader {
 
 type Messages = Box<dyn Iterator<Item = Result<v1::ResourceServiceWatchResponse, Status>> + Send>;
 
-/// A snapshot in messages that are not too large, each made when it is wanted; anything else as it is.
+/// A snapshot in messages of limited size, each created on demand; other messages unchanged.
 fn messages(
     told: WatchMessage,
     filter: &WatchFilter,
