@@ -520,35 +520,6 @@ mod tests {
     }
 
     #[test]
-    fn what_goes_the_way_out_as_far_as_it_is_deep_is_out() {
-        let mut random = ChaCha8Rng::seed_from_u64(2);
-        let mut deep = 0;
-        for _ in 0..4_000 {
-            let (mut a, mut b) = (Solid::random(&mut random), Solid::random(&mut random));
-            // Of what is round the depth is exact, and the way is only near to the shortest.
-            let is_round = |solid: &Solid| matches!(solid.geometry, Geometry::Capsule { .. } | Geometry::Sphere { .. });
-            if is_round(&a) || is_round(&b) {
-                continue;
-            }
-            b.pose.position = a.pose.position.map(|c| c + random.random_range(-0.1..0.1));
-            let placed = |solid: &Solid| solid.geometry.at(solid.pose);
-            let shapes = [&a, &b].map(|solid| placed(solid).geometry.shape(0.0));
-            let at = |solid: &Solid| to_f32(&placed(solid).pose);
-            let depth_m = depth(&at(&a), &*shapes[0], &at(&b), &*shapes[1]);
-            if gap(&at(&a), &*shapes[0], &at(&b), &*shapes[1], 0.0).unwrap() > 0.0 || depth_m < 1e-3 {
-                continue;
-            }
-            deep += 1;
-            let way = way_out(&at(&a), &*shapes[0], &at(&b), &*shapes[1]).unwrap();
-            assert!((dot(way, way) - 1.0).abs() < 1e-6, "{way:?}");
-            a.pose.position = plus(a.pose.position, way, depth_m + 1e-5);
-            let apart = gap(&at(&a), &*shapes[0], &at(&b), &*shapes[1], 0.1).unwrap();
-            assert!(apart > 0.0, "{apart} after {depth_m} along {way:?}: {a:?} {b:?}");
-        }
-        assert!(deep > 200, "{deep}");
-    }
-
-    #[test]
     fn the_work_of_two_meshes_has_a_bound() {
         // Waves that run along each other.
         let height = |i: u32| f64::from(i % 2) * 1e-3;

@@ -5,6 +5,8 @@
 mod common;
 
 use common::{Cell, request};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::collision::{Checker, Contact};
@@ -220,4 +222,40 @@ fn a_trajectory_that_goes_deeper_or_comes_back_is_refused() {
         validate_trajectory(&blind.robot, &with_fork, &blind.state(), &plan.trajectory, Contact::None).unwrap_err();
     let Violation::Collision { time_s, collision } = &deeper else { panic!("{deeper}") };
     assert!(*time_s < 1.0 && collision.other == "fork", "{deeper}");
+}
+
+#[test]
+fn what_goes_the_shortest_way_out_as_far_as_it_is_deep_is_out() {
+    let mut random = ChaCha8Rng::seed_from_u64(2);
+    let mut deep = 0;
+    for _ in 0..4_000 {
+        let mut body = |random: &mut ChaCha8Rng| {
+            let mut length = || 10_f64.powf(random.random_range(-2.3..-0.4));
+            let (a, b, c) = (length(), length(), length());
+            let is_box = random.random_bool(0.5);
+            let geometry = if is_box {
+                Geometry::Box { half: [a, b, c] }
+            } else {
+                Geometry::Cylinder { radius: a, half_length: b }
+            };
+            let mut range = |most: f64| random.random_range(-most..most);
+            let position = [range(0.1), range(0.1), range(0.1)];
+            geometry.at(Pose::from_rpy(position, range(3.2), range(3.2), range(3.2)))
+        };
+        let (first, second) = (body(&mut random), body(&mut random));
+        let (shape, its) = (first.geometry.shape(0.0), second.geometry.shape(0.0));
+        let of = to_f32(&second.pose);
+        let gap = |pose: &Pose| distance::gap(&to_f32(pose), &*shape, &of, &*its, 0.1).unwrap();
+        let depth_m = distance::depth(&to_f32(&first.pose), &*shape, &of, &*its);
+        if gap(&first.pose) > 0.0 || depth_m < TOUCHES_M {
+            continue;
+        }
+        deep += 1;
+        let way = distance::way_out(&to_f32(&first.pose), &*shape, &of, &*its).unwrap();
+        assert!((way.iter().map(|c| c * c).sum::<f64>() - 1.0).abs() < 1e-6, "{way:?}");
+        let position = std::array::from_fn(|i| first.pose.position[i] + way[i] * (depth_m + 1e-5));
+        let apart = gap(&Pose { position, ..first.pose });
+        assert!(apart > 0.0, "{apart} after {depth_m} along {way:?}: {first:?} {second:?}");
+    }
+    assert!(deep > 1_000, "{deep}");
 }
