@@ -14,6 +14,7 @@ use ratn_motion::description::RobotDescription;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::plan::Goal;
 use ratn_motion::robot::{Configuration, Robot, UNSAID};
+use ratn_world::scene::Scene;
 use std::f64::consts::{FRAC_PI_2, PI};
 
 mod bench;
@@ -280,4 +281,49 @@ fn what_is_let_go_on_the_edge_of_its_neighbour_was_not_set_down_there() {
     let both = |contact: &Contact| contact.bodies.iter().all(|body| body.starts_with("slc_"));
     let found = bench.cell.unintended_contacts();
     assert!(found.iter().any(|contact| both(contact) && contact.depth_m > 0.004), "{found:#?}");
+}
+
+/// One finger has come down on a box that is not where it was believed to be: so much of the finger is above the box, and so far below the box's top it
+/// went. Also what is believed of the scene: the box where it was before.
+fn come_down_on_a_box(over_m: f64, below_m: f64) -> (Bench, Scene) {
+    let mut bench = Bench::new(1, 4);
+    let (truth, believed) = (bench.cell.ground_truth()[0].clone(), bench.cell.scene());
+    let robot = bench.cell.robot();
+    let part = robot.finger_parts()[0];
+    let (outer, tip) = (robot.open_finger_m() + 2.0 * part.half[1], part.middle[2] + part.half[2]);
+    let top = truth.pose.position[2] + truth.size[2] / 2.0;
+    let goals = aimm::grasp_poses(&truth.pose, truth.size).map(|tool| {
+        let aside = tool.compose(&Pose::at(0.0, outer + truth.size[1] / 2.0 - over_m, 0.0));
+        let [x, y, _] = aside.position;
+        Goal::Pose(Pose { position: [x, y, top + tip - below_m], ..aside })
+    });
+    bench.go_regardless_of("slc_1", goals.to_vec(), 0.0, 0.10);
+    (bench, believed)
+}
+
+#[test]
+fn an_arm_that_leaves_what_its_fingers_came_down_on_pushes_it_no_further() {
+    let mut pressed = Vec::new();
+    // The finger stands on the box, or has pushed it aside.
+    for (over_m, below_m) in [(0.02, 0.014), (0.02, 0.020), (0.008, 0.030)] {
+        let (mut bench, believed) = come_down_on_a_box(over_m, below_m);
+        bench.pass(1.0);
+        let before = bench.cell.ground_truth()[0].clone();
+        let [touched] = &bench.cell.unintended_contacts()[..] else { panic!("{:?}", bench.cell.unintended_contacts()) };
+        assert!(touched.bodies[0].starts_with("finger"), "{touched}");
+        let home = bench.plan(&believed, vec![Goal::Joints(aimm::HOME)], 0.10, 0.0);
+        bench.done(Request::Follow { trajectory: home });
+        bench.pass(1.0);
+        let after = bench.cell.ground_truth()[0].clone();
+        // What was pressed into the table comes up again, by itself, and stands; what was not stays where it is.
+        let stands = aimm::TABLE_HEIGHT_M + after.size[2] / 2.0;
+        assert!(after.on == "table" && (after.pose.position[2] - stands).abs() < TOLERANCE_M, "{after:?}");
+        let moved = after.pose.distance(&before.pose);
+        let was_pressed = before.pose.position[2] < stands - TOLERANCE_M;
+        assert!(was_pressed || moved < TOLERANCE_M, "{moved} after {touched}");
+        pressed.push(was_pressed);
+        let [contact] = &bench.cell.unintended_contacts()[..] else { panic!("{:?}", bench.cell.unintended_contacts()) };
+        assert!(contact.began == touched.began && contact.pushed_m < touched.pushed_m + TOLERANCE_M, "{contact}");
+    }
+    assert_eq!(pressed, [true, true, false]);
 }

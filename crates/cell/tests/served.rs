@@ -184,7 +184,20 @@ async fn the_detector_finds_the_boxes_through_the_leased_camera() {
         assert!(truth.iter().map(off).fold(f64::INFINITY, f64::min) < 0.008);
         let located = system.execute(&lease, "Detector", "locate", [("object", found.clone())]).await.unwrap();
         assert!(matches!(&located.outputs["pose"], Value::Pose(again) if again.distance(pose) < 0.003));
+        let confirmed = system.execute(&lease, "Detector", "confirm", [("object", found.clone())]).await.unwrap();
+        assert!(matches!(&confirmed.outputs["pose"], Value::Pose(again) if again.distance(pose) < 0.005));
     }
+    // Where none stands: above the edge of the table.
+    let missing = Value::map([
+        ("id", Value::String("box_9".to_owned())),
+        ("pose", Value::Pose(Pose::at(x, y + 0.56, aimm::TABLE_HEIGHT_M + 0.05))),
+        ("size", boxes.iter().next().unwrap().field("size").unwrap().clone()),
+    ]);
+    let located = system.execute(&lease, "Detector", "locate", [("object", missing.clone())]).await.unwrap();
+    let confirmed = system.execute(&lease, "Detector", "confirm", [("object", missing)]).await.unwrap();
+    assert_eq!([&located.outcome, &confirmed.outcome], ["aborted", "gone"]);
+    assert_eq!(located.reason, confirmed.reason);
+    assert!(confirmed.reason.starts_with("box_9 is not near"), "{confirmed:?}");
     system.end.cancel();
 }
 

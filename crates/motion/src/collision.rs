@@ -24,6 +24,10 @@ use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
 
+mod touching;
+
+pub(crate) use touching::Touch;
+
 /// How much room the planner keeps around the moving shapes where it begins and ends, in metres.
 pub const PADDING_M: f64 = crate::arm::OVERHANG_M;
 
@@ -467,7 +471,8 @@ impl<'a> Checker<'a> {
         (0..=steps).find_map(|i| self.collision(&between(from, to, i as f64 / steps as f64), contact))
     }
 
-    fn hit(&mut self, arm: &JointVector, contact: Contact) -> Option<(usize, Other)> {
+    /// Brings the arm to a posture.
+    fn place(&mut self, arm: &JointVector) {
         self.configuration.arm = *arm;
         self.robot.update_arm(&self.configuration, &mut self.poses);
         for (i, moving) in self.moving.iter().enumerate() {
@@ -475,6 +480,10 @@ impl<'a> Checker<'a> {
             self.centres[i] = pose.translation;
             self.placed[i] = pose;
         }
+    }
+
+    fn hit(&mut self, arm: &JointVector, contact: Contact) -> Option<(usize, Other)> {
+        self.place(arm);
         // The hand and what it holds are the likeliest to touch something.
         for i in (0..self.moving.len()).rev() {
             let moving = &self.moving[i];

@@ -61,6 +61,29 @@ pub fn depth(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> f64 
     if cores > 0.0 {
         return (radii - cores).max(0.0);
     }
+    let found = contact.map(|contact| contact.normal1.to_array().map(f64::from));
+    least_overlap(&first, &second, found).map_or(0.0, |(_, overlap)| overlap.max(0.0))
+}
+
+/// Where the first of two shapes that touch has to go, as seen from the world, to be out of the other on the shortest way that is known; its length is
+/// 1. `None` where nothing is known.
+pub fn way_out(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> Option<Point> {
+    let pose = a_at.inv_mul(b_at);
+    let contact = DefaultQueryDispatcher.contact(&pose, a, b, ROUGH_M).ok().flatten();
+    let found = contact.map(|contact| contact.normal1.to_array().map(f64::from));
+    let to_second = match (Round::of(a), Round::of(b)) {
+        (Some(first), Some(second)) => least_overlap(&first, &Turned::new(second, &pose), found)?.0,
+        _ => found?,
+    };
+    let [x, y, z] = to_second.map(|c| -c as f32);
+    let way = (a_at.rotation * Vector::new(x, y, z)).to_array().map(f64::from);
+    let length = norm(way);
+    (length > SAME_M).then(|| way.map(|c| c / length))
+}
+
+/// The direction, of length 1 and seen from the first of two shapes, along which they overlap least, and how far: the second one leaves the
+/// first that way. Beside what is `found` those are tried that can be it.
+fn least_overlap(first: &Round, second: &Turned, found: Option<Point>) -> Option<(Point, f64)> {
     let turned = |axes: Vec<Point>| axes.into_iter().map(|axis| second.rotate(axis)).collect::<Vec<Point>>();
     let (lines, its) = (first.core.lines(), turned(second.round.core.lines()));
     // Across faces, across one edge or axis of each, away from an axis, and from middle to middle: whatever the way, the shapes are no deeper in each
@@ -72,14 +95,14 @@ pub fn depth(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> f64 
         difference(second.at, line.map(|c| c * along))
     };
     let away = lines.iter().chain(&its).map(aside);
-    let found = contact.map(|contact| contact.normal1.to_array().map(f64::from));
     let ways = faces.into_iter().chain(across).chain(away).chain([second.at, [1.0, 0.0, 0.0]]).chain(found);
     let ways = ways.flat_map(|way| [way, way.map(|c| -c)]);
     let overlap = |way: Point| {
         let length = norm(way);
-        (length > SAME_M).then(|| first.along(way.map(|c| c / length)) + second.along(way.map(|c| -c / length)))
+        let way = way.map(|c| c / length);
+        (length > SAME_M).then(|| (way, first.along(way) + second.along(way.map(|c| -c))))
     };
-    ways.filter_map(overlap).fold(f64::INFINITY, f64::min).max(0.0)
+    ways.filter_map(overlap).min_by(|(_, a), (_, b)| a.total_cmp(b))
 }
 
 /// As [`gap`], the second shape seen from the first.

@@ -38,6 +38,7 @@ pub mod inside;
 pub mod joint_vector;
 pub mod keep;
 mod ladder;
+mod leaving;
 mod levers;
 pub mod line;
 pub mod looks;

@@ -9,7 +9,8 @@
 //! surroundings, the arm may not. On the free path nothing touches anything: it is searched with the vector checks, between
 //! postures that have room for them; where the start or a candidate has less, a short way out of there comes first. Where the
 //! tool is to stay upright, the free path keeps it so (`constrained`), and the straight parts do anyway. Where the tool is to go in
-//! straight lines, they take the place of the free path (`way_points`).
+//! straight lines, they take the place of the free path (`way_points`). Where the gripper is in something at the start, a retreat from there
+//! comes first (`retreat`).
 
 mod arm_in_scene;
 mod candidates;
@@ -17,6 +18,7 @@ mod contact;
 mod departure;
 mod error;
 mod improvement;
+mod retreat;
 mod straight_ways;
 
 use crate::collision::{Contact, distance, length};

@@ -3,6 +3,7 @@
 use crate::collision::{Checker, Collision, Contact};
 use crate::cubic::Cubic;
 use crate::joint_vector::{JointVector, PerJoint};
+use crate::leaving::Leaving;
 use crate::request::unit;
 use crate::robot::{Configuration, Joint, Robot};
 use crate::trajectory::{Curve, Knot, TrajectoryError};
@@ -174,30 +175,66 @@ pub(crate) fn check_limits(joints: &[Joint], trajectory: &Curve) -> Result<(), V
     Ok(())
 }
 
-/// Looks at the middle of a piece of the curve: where there is more room than anything moves from there within the piece, the piece is
-/// free; else its halves are looked at, until they are so short that nothing moves by more than [`RESOLUTION_M`].
-pub(crate) fn check_collisions(
-    checker: &mut Checker<'_>,
-    trajectory: &Curve,
-    contact: Contact,
-) -> Result<(), Violation> {
-    check_collisions_while(checker, trajectory, contact, &mut || true).map(|_| ())
+/// All of a motion, at whose start the gripper may be in something: that is left first, as a retreat does ([`Leaving`]).
+fn check_collisions(checker: &mut Checker<'_>, trajectory: &Curve, contact: Contact) -> Result<(), Violation> {
+    let whole = [0.0, trajectory.duration_s()];
+    let start = trajectory.knots()[0].positions;
+    let stands_in = if checker.is_free(&start, contact) { None } else { Leaving::from(checker, &start) };
+    let Some(leaving) = stands_in else {
+        return check_part(checker, trajectory, whole, contact, &mut || true).map(|_| ());
+    };
+    let mut rest = leaving.of_the_rest(checker);
+    let left_s = left_after_s(leaving, checker, trajectory)?;
+    check_part(&mut rest, trajectory, [0.0, left_s], contact, &mut || true)?;
+    check_part(checker, trajectory, [left_s, whole[1]], contact, &mut || true).map(|_| ())
 }
 
-/// The same as long as `goes_on`, which is asked before each look, says yes; whether all of it was looked at.
+/// When everything that was touched at the start has been left.
+fn left_after_s(mut leaving: Leaving, checker: &mut Checker<'_>, trajectory: &Curve) -> Result<f64, Violation> {
+    for (i, pair) in trajectory.knots().windows(2).enumerate() {
+        let lasts_s = pair[1].time_s - pair[0].time_s;
+        let ranges = trajectory.cubics(i).map(|cubic| cubic.range(0.0, lasts_s));
+        let most = JointVector::from_fn(pair[0].positions.len(), |j| ranges[j][1] - ranges[j][0]);
+        let looks = ((checker.moves_m(&most) / RESOLUTION_M).ceil() as usize).max(1);
+        for look in 1..=looks {
+            let time_s = pair[0].time_s + lasts_s * look as f64 / looks as f64;
+            let posture = trajectory.sample(time_s).positions;
+            leaving.comes_to(checker, &posture).map_err(|collision| Violation::Collision { time_s, collision })?;
+            if leaving.is_over() {
+                return Ok(time_s);
+            }
+        }
+    }
+    Err(Violation::Collision { time_s: trajectory.duration_s(), collision: leaving.told() })
+}
+
+/// As [`check_part`] of the whole motion, as long as `goes_on`, which is asked before each look, says yes; whether all of it was looked at.
 pub(crate) fn check_collisions_while(
     checker: &mut Checker<'_>,
     trajectory: &Curve,
     contact: Contact,
     goes_on: &mut dyn FnMut() -> bool,
 ) -> Result<bool, Violation> {
+    check_part(checker, trajectory, [0.0, trajectory.duration_s()], contact, goes_on)
+}
+
+/// Looks at the middle of a piece of the curve: where there is more room than anything moves from there within the piece, the piece is
+/// free; else its halves are looked at, until they are so short that nothing moves by more than [`RESOLUTION_M`].
+fn check_part(
+    checker: &mut Checker<'_>,
+    trajectory: &Curve,
+    [begins_s, ends_s]: [f64; 2],
+    contact: Contact,
+    goes_on: &mut dyn FnMut() -> bool,
+) -> Result<bool, Violation> {
     let knots = trajectory.knots();
     let collides = |time_s| move |collision| Violation::Collision { time_s, collision };
-    checker.room(&knots[0].positions, contact, 0.0).map_err(collides(0.0))?;
+    checker.room(&trajectory.sample(begins_s).positions, contact, 0.0).map_err(collides(begins_s))?;
     for (i, pair) in knots.windows(2).enumerate() {
         let cubics = trajectory.cubics(i);
+        let within = [begins_s.max(pair[0].time_s), ends_s.min(pair[1].time_s)].map(|time_s| time_s - pair[0].time_s);
         // In order of time: the last is taken first.
-        let mut pieces = vec![[0.0, pair[1].time_s - pair[0].time_s]];
+        let mut pieces = if within[0] < within[1] { vec![within] } else { Vec::new() };
         while let Some([from, to]) = pieces.pop() {
             if !goes_on() {
                 return Ok(false);
@@ -215,7 +252,6 @@ pub(crate) fn check_collisions_while(
             }
         }
     }
-    let end = &knots[knots.len() - 1];
-    checker.room(&end.positions, contact, 0.0).map_err(collides(end.time_s))?;
+    checker.room(&trajectory.sample(ends_s).positions, contact, 0.0).map_err(collides(ends_s))?;
     Ok(true)
 }

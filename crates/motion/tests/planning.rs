@@ -173,13 +173,13 @@ fn what_is_let_go_is_put_so_that_the_open_fingers_press_nobody() {
 }
 
 #[test]
-fn an_arm_that_was_stopped_a_millimetre_beside_something_leaves_it() {
+fn an_arm_that_was_stopped_a_millimetre_beside_something_or_a_little_in_it_leaves_it() {
     let mut cell = Cell::with_boxes(0, 1);
     let configuration = Configuration { arm: cell.arm, ..cell.robot.at_zero() };
     // The hand is 0.15 m wide along y, and its middle 0.085 m behind the tool's.
     let beside = |room_m: f64| Pose::at(0.0, 0.075 + room_m + 0.025, -0.085);
     let tool = cell.robot.tool_pose(&configuration);
-    for (room_m, leaves) in [(0.001, true), (-0.003, false)] {
+    for room_m in [0.001, -0.003] {
         cell.scene.objects.retain(|object| object.name != "post");
         cell.scene.objects.push(SceneObject {
             name: "post".into(),
@@ -187,10 +187,8 @@ fn an_arm_that_was_stopped_a_millimetre_beside_something_leaves_it() {
             placement: Placement::World(tool.compose(&beside(room_m))),
         });
         let plan = cell.plan(&request(cell.state(), vec![Goal::Joints(aimm::HOME)]));
-        assert_eq!(plan.is_ok(), leaves, "{room_m}: {plan:?}");
-        if let Ok(plan) = plan {
-            assert_valid(&cell, &plan, 0.3);
-        }
+        let plan = plan.unwrap_or_else(|error| panic!("{room_m}: {error}"));
+        validate_trajectory(&cell.robot, &cell.scene, &cell.state(), &plan.trajectory, Contact::None).unwrap();
     }
 }
 

@@ -52,6 +52,8 @@ struct Mishaps {
     grasps: Vec<usize>,
     motions: Vec<usize>,
     pictures: Vec<usize>,
+    /// A look beside an approach gets no picture.
+    looks: Vec<usize>,
 }
 
 #[derive(Debug, Default)]
@@ -131,6 +133,15 @@ impl Room {
         let found = there.min_by(|a, b| a.pose.distance(&near).total_cmp(&b.pose.distance(&near)));
         let found = found.filter(|thing| thing.pose.distance(&near) < 0.05).ok_or("it is not where it was")?;
         Ok(described(found).into())
+    }
+
+    /// The same look, of which the failure is named: `gone` where the object is not there.
+    fn confirm(&mut self, goal: &Goal) -> Result<Outputs, String> {
+        let look = self.occasion("look");
+        if self.mishaps.looks.contains(&look) {
+            return Err("no image".to_owned());
+        }
+        self.locate(goal).map_err(|_| "gone".to_owned())
     }
 
     /// A way to the first pose of a goal, unless something that is believed to be there is in the way.
@@ -279,6 +290,7 @@ impl Oracle for Room {
         let done = match (&*goal.provider, &*goal.action) {
             ("detector", "segment") => self.segment(goal),
             ("detector", "locate") => self.locate(goal),
+            ("detector", "confirm") => self.confirm(goal),
             ("path_planner", "plan") => self.plan(goal, world),
             ("arm", "follow") => match &goal.inputs["trajectory"] {
                 Value::Trajectory(way) => {
@@ -296,7 +308,9 @@ impl Oracle for Room {
             }
             other => panic!("{other:?}"),
         };
-        let (outcome, outputs) = done.map_or_else(|_| ("aborted", Vec::new()), |outputs| ("success", outputs));
+        let failed = |reason: String| if reason == "gone" { "gone" } else { "aborted" };
+        let (outcome, outputs) =
+            done.map_or_else(|reason| (failed(reason), Vec::new()), |outputs| ("success", outputs));
         let outputs: BTreeMap<String, Value> =
             outputs.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
         let answer = Answer::Finished { outcome: outcome.to_owned(), measured: measured(goal, &outputs), outputs };
@@ -630,6 +644,39 @@ fn no_fingers_come_down_on_what_is_to_be_set_and_somebody_moved_before_the_arm_s
             let case = format!("{occasion:?}, {look_s} s, {mode:?}");
             assert_eq!((run.outcome.as_str(), set(&looking.0)), ("success", 3), "{case}: {}", run.reason);
             assert!(looking.0.hits == 0 || look_s > 8.0, "{case}");
+        }
+    }
+}
+
+/// A room, and how the looks beside approaches ended in it.
+struct Looks(Room, Vec<String>);
+
+impl Oracle for Looks {
+    fn perform(&mut self, path: &str, attempt: u32, goal: &Goal, world: &World) -> Performance {
+        let performance = self.0.perform(path, attempt, goal, world);
+        if let (true, Answer::Finished { outcome, .. }) = (path.ends_with("/look_again"), &performance.answer) {
+            self.1.push(outcome.clone());
+        }
+        performance
+    }
+}
+
+#[test]
+fn a_camera_that_fails_is_asked_again_and_one_that_sees_that_the_object_is_gone_is_not() {
+    // Somebody takes it away as the way to it is planned.
+    let gone = Mishaps { moved: BTreeMap::from([(("plan", 1), (0, 0.08))]), ..Mishaps::default() };
+    let blind = Mishaps { looks: vec![1], ..Mishaps::default() };
+    let boxes = ("fetch_boxes_recovering", vec![("boxes", 1)], on_table(0));
+    let bowls = ("set_table_recovering", vec![("bowls", 1), ("forks", 0)], bowl(0));
+    for (task, parameters, thing) in [boxes, bowls] {
+        for (mishaps, expected) in [(&gone, ["gone", "success"]), (&blind, ["aborted", "success"])] {
+            for mode in MODES {
+                let room = Room { things: vec![thing.clone()], mishaps: mishaps.clone(), ..Room::default() };
+                let mut looks = Looks(room, Vec::new());
+                let run = perform_with(task, mode, &parameters, &mut looks, |looks| &mut looks.0);
+                assert_eq!(run.outcome, "success", "{task}, {expected:?}, {mode:?}: {}", run.reason);
+                assert_eq!(looks.1, expected, "{task}, {mode:?}");
+            }
         }
     }
 }

@@ -27,9 +27,13 @@ use std::sync::Arc;
 const SEGMENT_FRAMES: i64 = 60;
 /// Number of frames in a picture in which one known object is searched.
 const LOCATE_FRAMES: i64 = 8;
+/// Number of frames in a picture that only confirms a known object.
+const CONFIRM_FRAMES: i64 = 4;
 /// Standard deviations of a surface whose height the goal gives: of its height, and of its tilt; as for furniture and floors.
 const SURFACE_SIGMA_M: f64 = 0.001;
 const SURFACE_SIGMA_RAD: f64 = 0.002;
+/// The outcome of `detector/confirm` where the object is not there. Where the camera fails it is `aborted`.
+const GONE: &str = "gone";
 /// Maximum number of robot postures in one picture.
 const MAX_POSTURES: usize = 64;
 
@@ -45,7 +49,7 @@ pub async fn run(options: WorkerOptions, robot: Robot, pictures: Option<PathBuf>
 /// The worker, not running yet.
 pub fn worker(options: WorkerOptions, robot: Robot, pictures: Option<PathBuf>) -> Worker {
     let eyes = Eyes { robot: Arc::new(robot), pictures: Pictures::into(pictures) };
-    Worker::new(options).action(Segment(eyes.clone())).action(Locate(eyes))
+    Worker::new(options).action(Segment(eyes.clone())).action(Locate(eyes.clone())).action(Confirm(eyes))
 }
 
 /// The action `detector/segment`: finds all objects on a surface in a region.
@@ -56,7 +60,11 @@ pub struct Segment(Eyes);
 #[derive(Debug)]
 pub struct Locate(Eyes);
 
-/// What both actions need to take and evaluate pictures.
+/// The action `detector/confirm`: looks whether a known object is still there.
+#[derive(Debug)]
+pub struct Confirm(Eyes);
+
+/// What the actions need to take and evaluate pictures.
 #[derive(Debug, Clone)]
 struct Eyes {
     robot: Arc<Robot>,
@@ -139,27 +147,61 @@ impl Action for Locate {
     }
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
-        let object = goal.port("object");
-        let prior = Prior { pose: object.field("pose").pose()?, size: object.field("size").vector3()? };
-        let id = object.field("id").string()?.to_owned();
-        let (classes, facts) = (classes(&goal)?, Facts::of(&goal)?);
-        let surface = surface(&goal)?;
-        let one = move |seen: &Seen| {
-            let found = locate(&seen.image, &seen.camera, &prior, &classes, &seen.body)?;
-            Ok(found.into_iter().map(|object| seen.in_the_world(object, surface.as_ref())).collect())
-        };
-        let found = self.0.find(&goal, LOCATE_FRAMES, one).await?.pop().ok_or_else(|| {
-            let [x, y, z] = prior.pose.position;
-            ActionFailure::aborted(format!("{id} is not near ({x:.2}, {y:.2}, {z:.2}), where it was seen before"))
-        })?;
-        let outcome = facts.write(GoalOutcome::success(), &id, &found);
-        Ok(described(&found).into_iter().fold(outcome, |out, (name, value)| out.with_output(name, value)))
+        self.0.look_for_one(&goal, LOCATE_FRAMES).await?.map_err(ActionFailure::aborted)
+    }
+}
+
+#[tonic::async_trait]
+impl Action for Confirm {
+    fn name(&self) -> &str {
+        "confirm"
+    }
+
+    fn checked_by(&self) -> Option<Signature> {
+        Signature::bundled("Detector", self.name())
+    }
+
+    fn description(&self) -> &str {
+        "Whether an object that was seen before is still there, and where it stands now."
+    }
+
+    fn can_be_suspended(&self) -> bool {
+        // It moves nothing.
+        true
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        let looked = self.0.look_for_one(&goal, CONFIRM_FRAMES).await?;
+        Ok(looked.unwrap_or_else(|reason| GoalOutcome { reason, ..GoalOutcome::named(GONE) }))
     }
 }
 
 impl Eyes {
-    /// Finds objects in a picture of the leased camera, on a thread of its own. That takes milliseconds: a goal that has to stop meanwhile
-    /// just drops the answer.
+    /// Looks for the object that a goal names: what was found, or why it counts as gone.
+    async fn look_for_one(
+        &self,
+        goal: &GoalContext,
+        default_frames: i64,
+    ) -> Result<Result<GoalOutcome, String>, ActionFailure> {
+        let object = goal.port("object");
+        let prior = Prior { pose: object.field("pose").pose()?, size: object.field("size").vector3()? };
+        let id = object.field("id").string()?.to_owned();
+        let (classes, facts) = (classes(goal)?, Facts::of(goal)?);
+        let surface = surface(goal)?;
+        let one = move |seen: &Seen| {
+            let found = locate(&seen.image, &seen.camera, &prior, &classes, &seen.body)?;
+            Ok(found.into_iter().map(|object| seen.in_the_world(object, surface.as_ref())).collect())
+        };
+        let Some(found) = self.find(goal, default_frames, one).await?.pop() else {
+            let [x, y, z] = prior.pose.position;
+            return Ok(Err(format!("{id} is not near ({x:.2}, {y:.2}, {z:.2}), where it was seen before")));
+        };
+        let outcome = facts.write(GoalOutcome::success(), &id, &found);
+        Ok(Ok(described(&found).into_iter().fold(outcome, |out, (name, value)| out.with_output(name, value))))
+    }
+
+    /// Finds objects in a picture of the leased camera, on a thread of its own. That takes milliseconds: a goal that has to stop meanwhile just
+    /// drops the answer.
     async fn find(
         &self,
         goal: &GoalContext,

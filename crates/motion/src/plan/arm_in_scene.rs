@@ -14,6 +14,7 @@ use crate::diagnosis::{crowding, sphere_touches};
 use crate::joint_vector::JointVector;
 use crate::keep::{KeptAxis, timed_keeping};
 use crate::ladder;
+use crate::leaving::{Leaving, NOTHING_NEW};
 use crate::line::{self, Cause, LineError, Lines};
 use crate::mechanism::Mechanism;
 use crate::pace::{Pace, Stop};
@@ -46,6 +47,15 @@ pub(super) const PADDINGS_M: [f64; 3] = [PADDING_M, TIGHT_PADDING_M, 0.0];
 /// Postures tried around one that has no room, and how far away the last of them are, in radians per joint.
 const WAYS_OUT: usize = 100;
 const WAY_OUT_RAD: f64 = 0.4;
+
+/// How far a retreat goes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Extent {
+    /// All of the straight part.
+    Whole,
+    /// To the first posture that is free.
+    UntilFree,
+}
 
 /// The exact shapes of a request in a scene.
 fn checker<'a>(
@@ -214,6 +224,47 @@ impl<'a> ArmInScene<'a> {
             Some(Cause::Blocked { reason }) => Err(reason),
             _ => traced.whole().map_err(|error| error.to_string()),
         })
+    }
+
+    /// What the gripper touches in a posture, to be left from there; `None` where it touches nothing.
+    pub(super) fn leaving(&mut self, from: &JointVector) -> Option<Leaving> {
+        Leaving::from(&mut self.checker, from)
+    }
+
+    /// Postures along a straight part that leaves what the gripper touches at its beginning, the last of them free; or what ends it early.
+    pub(super) fn retreat(
+        &mut self,
+        from: &JointVector,
+        leaving: &Leaving,
+        part: &Straight,
+        extent: Extent,
+        pace: &mut Pace<'_>,
+    ) -> Result<Result<Vec<JointVector>, String>, Stop> {
+        let to = arm::moved(&self.reach, from, self.way(part, from));
+        let lines = Lines::new(self.reach.pose(from), &[to], 0.0);
+        let (mut rest, mut leaving, mut is_out) = (leaving.of_the_rest(&self.checker), leaving.clone(), false);
+        let checker = &mut self.checker;
+        let is_free = &mut |from: &JointVector, to: &JointVector| {
+            if is_out && extent == Extent::UntilFree {
+                return Err("it is out".to_owned());
+            }
+            if let Some(collision) = rest.edge_collision(from, to, NOTHING_NEW) {
+                return Err(collision.to_string());
+            }
+            leaving.goes(checker, from, to).map_err(|collision| format!("{collision}, deeper than before"))?;
+            is_out = leaving.is_over() && checker.is_free(to, Contact::None);
+            Ok(())
+        };
+        let traced = line::nearest(&self.reach, &lines, from, is_free, &mut || pace.answer())?;
+        if is_out && extent == Extent::UntilFree {
+            return Ok(Ok(traced.postures));
+        }
+        let postures = match traced.whole() {
+            Ok(postures) => postures,
+            Err(error) => return Ok(Err(error.to_string())),
+        };
+        let end = self.collision(&postures[postures.len() - 1], Contact::None);
+        Ok(end.map_or(Ok(postures), |collision| Err(format!("at its end {collision}"))))
     }
 
     /// Postures along a straight part that ends in a posture, against its direction, each solved from the one before: from another posture at the

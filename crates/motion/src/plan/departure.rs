@@ -3,22 +3,40 @@
 use super::arm_in_scene::{ArmInScene, PADDINGS_M};
 use super::contact::half_finger_m;
 use super::error::PlanError;
+use super::retreat::retreat;
 use crate::collision::{CONTACT_TOLERANCE_M, Contact};
 use crate::joint_vector::JointVector;
 use crate::pace::Pace;
 
-/// Its postures, one where there is no such part; the last of them is free. With as much padding as the start has.
+/// Its postures, one where there is no such part; the last of them is free. With as much padding as the start has. Where the gripper is in something
+/// at the start, and cannot depart as it was asked to, it retreats from there.
 pub(super) fn departure(arm: &mut ArmInScene<'_>, pace: &mut Pace<'_>) -> Result<Vec<JointVector>, PlanError> {
+    match with_paddings(arm, pace, padded_departure)? {
+        Ok(postures) => Ok(postures),
+        Err(refused) => match with_paddings(arm, pace, retreat)? {
+            Ok(Some(postures)) => Ok(postures),
+            Ok(None) => Err(refused),
+            Err(no_retreat) => Err(no_retreat),
+        },
+    }
+}
+
+/// The first way that there is, with the greatest padding that allows one, or why there is none with the least.
+fn with_paddings<'a, T>(
+    arm: &mut ArmInScene<'a>,
+    pace: &mut Pace<'_>,
+    mut find: impl FnMut(&mut ArmInScene<'a>, &mut Pace<'_>) -> Result<T, PlanError>,
+) -> Result<Result<T, PlanError>, PlanError> {
     let mut refused = None;
     for padding_m in PADDINGS_M {
         arm.pad(padding_m);
-        match padded_departure(arm, pace) {
-            Ok(postures) => return Ok(postures),
+        match find(arm, pace) {
+            Ok(found) => return Ok(Ok(found)),
             Err(error @ (PlanError::Cancelled | PlanError::TimeUp)) => return Err(error),
             Err(error) => refused = Some(error),
         }
     }
-    Err(refused.expect("there is a padding"))
+    Ok(Err(refused.expect("there is a padding")))
 }
 
 fn padded_departure(arm: &mut ArmInScene<'_>, pace: &mut Pace<'_>) -> Result<Vec<JointVector>, PlanError> {

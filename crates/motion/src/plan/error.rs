@@ -29,6 +29,14 @@ pub enum PlanError {
         /// What touches what.
         collision: Collision,
     },
+    /// The gripper touches something where the arm stands, and no straight way out of it is free.
+    #[error("at the start {collision}, and it cannot be left: {}", reasons.join("; "))]
+    NoRetreat {
+        /// What is touched deepest.
+        collision: Collision,
+        /// Which ways were tried, and what ends each of them.
+        reasons: Vec<String>,
+    },
     /// The straight part at the start cannot be followed.
     #[error("departing {part}: {reason}")]
     Depart {

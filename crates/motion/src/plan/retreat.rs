@@ -1,0 +1,39 @@
+//! A start in contact: the straight way out of it.
+//!
+//! What may be touched on the way, `leaving` says. Tried are the departure that was asked for, all of it; back along the tool's axis; and the
+//! shortest way out of what is touched deepest. The last two end in the first posture that is free.
+
+use super::arm_in_scene::{ArmInScene, Extent};
+use super::error::PlanError;
+use crate::joint_vector::JointVector;
+use crate::leaving::Leaving;
+use crate::pace::Pace;
+use crate::straight::{Frame, MAX_STRAIGHT_M, Straight};
+
+/// The postures of a retreat; `None` where the gripper touches nothing at the start.
+///
+/// # Errors
+/// Why no way out of what it touches can be followed.
+pub(super) fn retreat(arm: &mut ArmInScene<'_>, pace: &mut Pace<'_>) -> Result<Option<Vec<JointVector>>, PlanError> {
+    let start = arm.request().start.arm;
+    let Some(leaving) = arm.leaving(&start) else { return Ok(None) };
+    let mut reasons = Vec::new();
+    for (name, part, extent) in ways(arm, &leaving) {
+        match arm.retreat(&start, &leaving, &part, extent, pace)? {
+            Ok(postures) => return Ok(Some(postures)),
+            Err(reason) => reasons.push(format!("{name} {reason}")),
+        }
+    }
+    Err(PlanError::NoRetreat { collision: leaving.told(), reasons })
+}
+
+/// The ways that are tried, the one that was asked for first, with what messages call them.
+fn ways(arm: &ArmInScene<'_>, leaving: &Leaving) -> Vec<(String, Straight, Extent)> {
+    let asked = &arm.request().depart;
+    let asked = asked.is_some().then(|| (format!("{asked}"), asked.clone(), Extent::Whole));
+    let far = |direction, frame| Straight { direction, frame, length_m: MAX_STRAIGHT_M };
+    let back = ("back along the tool".to_owned(), far([0.0, 0.0, -1.0], Frame::Tool), Extent::UntilFree);
+    let out = leaving.shortest_way_out();
+    let out = out.map(|way| ("the shortest way out".to_owned(), far(way, Frame::World), Extent::UntilFree));
+    asked.into_iter().chain([back]).chain(out).collect()
+}
