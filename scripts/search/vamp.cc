@@ -1,8 +1,8 @@
 // VAMP's RRT-Connect and simplification on the problems of a text file of problems.py, a line per problem as `--example search` prints it:
 //
-//     vamp ROBOT PROBLEMS.txt [REPEAT [SAMPLES [SKIP]]]
+//     vamp ROBOT PROBLEMS.txt [REPEAT [SAMPLES [SKIP [PATHS]]]]
 //
-// SKIP samples of its Halton sequence are left out, for another sequence. Compile with VAMP's options (cmake/CompilerSettings.cmake) and its
+// SKIP samples of its Halton sequence are left out, for another sequence. PATHS is a file for the paths that were found, for `--example judge`. Compile with VAMP's options (cmake/CompilerSettings.cmake) and its
 // headers, nigh's, pdqsort's and Eigen's; with its clock, `std::chrono::steady_clock` in rrtc.hh, simplify.hh and utils.hh, replaced by one that
 // reads CLOCK_THREAD_CPUTIME_ID, the times are processor time.
 #include <cstdio>
@@ -58,10 +58,12 @@ static collision::Environment<float> read(std::ifstream &in, int things)
 }
 
 template <typename Robot>
-static int run(const char *file, float range, int repeat, std::size_t samples, int skip)
+static int run(const char *file, float range, int repeat, std::size_t samples, int skip, const char *paths)
 {
     using RRTC = planning::RRTC<Robot, rake, Robot::resolution>;
     std::ifstream in(file);
+    std::ofstream out(paths);
+    out.precision(9);
     std::string name;
     int index, things;
     while (in >> name >> index >> things)
@@ -103,6 +105,14 @@ static int run(const char *file, float range, int repeat, std::size_t samples, i
                 simplify = std::min(simplify, shorter.nanoseconds / 1e3);
                 before = found.path.cost();
                 after = shorter.path.cost();
+                if (i == 0)
+                {
+                    out << name << ' ' << index;
+                    for (const auto &posture : shorter.path)
+                        for (std::size_t j = 0; j < Robot::dimension; j++)
+                            out << ' ' << posture.to_array()[j];
+                    out << '\n';
+                }
             }
         }
         if (solved)
@@ -119,12 +129,13 @@ int main(int count, char **arguments)
     int repeat = count > 3 ? std::atoi(arguments[3]) : 1;
     std::size_t samples = count > 4 ? std::atol(arguments[4]) : 1000000;
     int skip = count > 5 ? std::atoi(arguments[5]) : 0;
+    const char *paths = count > 6 ? arguments[6] : "/dev/null";
     // VAMP's own ranges (constants.py).
     if (robot == "panda")
-        return run<robots::Panda>(arguments[2], 1.0F, repeat, samples, skip);
+        return run<robots::Panda>(arguments[2], 1.0F, repeat, samples, skip, paths);
     if (robot == "ur5")
-        return run<robots::UR5>(arguments[2], 1.5F, repeat, samples, skip);
+        return run<robots::UR5>(arguments[2], 1.5F, repeat, samples, skip, paths);
     if (robot == "fetch")
-        return run<robots::Fetch>(arguments[2], 1.0F, repeat, samples, skip);
-    return run<robots::Baxter>(arguments[2], 0.5F, repeat, samples, skip);
+        return run<robots::Fetch>(arguments[2], 1.0F, repeat, samples, skip, paths);
+    return run<robots::Baxter>(arguments[2], 0.5F, repeat, samples, skip, paths);
 }
