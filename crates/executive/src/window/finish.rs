@@ -33,7 +33,9 @@ impl Window {
                 let own = context.plan.state(instance.state);
                 let known = own.outcome(&outcome).map(|number| own.outcomes[number].clone());
                 let outcome = known.unwrap_or_else(|| outcome.into());
-                self.goal_ended(context, id, Ended { outcome, outputs, reason, changes, in_circles: false });
+                let answer = Ended { outcome, outputs, reason, changes, in_circles: false };
+                self.keep_answer(context, id, &answer);
+                self.goal_ended(context, id, answer);
             }
             (
                 Event::Crashed { reason, unknown, .. },
@@ -103,8 +105,20 @@ impl Window {
     }
 
     /// A node's result is known: gives back its resources.
-    pub(super) fn finish(&mut self, context: &mut Context<'_>, id: InstanceId, mut ended: Ended) {
-        let Some(instance) = self.graph.get(id) else { return };
+    pub(super) fn finish(&mut self, context: &mut Context<'_>, id: InstanceId, ended: Ended) {
+        let ended = self.end_of_answer(context, id, ended);
+        context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
+        let has_acted = self.graph.node(id).is_some_and(|node| node.status.is_running());
+        self.give_back(context, id);
+        self.graph.set_acted(id, has_acted);
+        self.rest(id);
+        self.end_node(context, id, ended);
+    }
+
+    /// The end of a node whose goal has answered so: with the values that it assigns, or `aborted` if the answer is no valid one or a value cannot be
+    /// evaluated.
+    pub(super) fn end_of_answer(&self, context: &Context<'_>, id: InstanceId, mut ended: Ended) -> Ended {
+        let Some(instance) = self.graph.get(id) else { return ended };
         let state = context.program.state(instance.state);
         let own = context.plan.state(instance.state);
         let failed =
@@ -125,12 +139,7 @@ impl Window {
         if let Err(problem) = self.assign(context, id, &mut ended) {
             ended = failed(&ended, problem);
         }
-        context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
-        let has_acted = instance.node().is_some_and(|node| node.status.is_running());
-        self.give_back(context, id);
-        self.graph.set_acted(id, has_acted);
-        self.rest(id);
-        self.end_node(context, id, ended);
+        ended
     }
 
     /// Ends a node that holds nothing any more. A detached PIA, which its line has already passed, retires at once.

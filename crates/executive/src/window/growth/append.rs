@@ -64,6 +64,7 @@ impl Growth {
                 crashes: 0,
                 not_before: Timestamp(0),
                 seen: None,
+                answer: None,
                 has_acted: false,
                 is_detached: false,
             }),
