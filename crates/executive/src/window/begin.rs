@@ -25,6 +25,7 @@ impl Window {
     /// Begins a node, or notes what it waits for.
     pub(super) fn begin(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.follow_root(context);
+        self.come_to_its_place(context, id);
         let looked = self.look(context, id, None, |instance, view| {
             let mut seen = Seen::default();
             let readiness = self.readiness(context, instance, view, &mut seen);

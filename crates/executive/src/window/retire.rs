@@ -63,6 +63,7 @@ impl Window {
                     retired = true;
                     continue;
                 }
+                self.come_to_its_place(context, id);
                 let has_ended = self.graph.get(id).is_some_and(|head| head.ended().is_some());
                 if !has_ended || !self.retire_head(context, id) {
                     break;

@@ -86,6 +86,8 @@ pub(crate) struct Node {
     pub(crate) has_acted: bool,
     /// Whether it is an imprecise PIA that runs while younger instances of its line go on.
     pub(crate) is_detached: bool,
+    /// Of a computing or sensing node: whether it has come to its place in the sequential program before it ended.
+    pub(crate) is_at_its_place: bool,
 }
 
 /// The status of a node. Retired and discarded nodes are no longer in the window.

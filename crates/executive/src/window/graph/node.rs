@@ -130,12 +130,21 @@ impl Graph {
         }
     }
 
-    /// The count of tries begins again, because the inputs have changed.
+    /// The count of tries begins again, because the inputs have changed. The sequential program counts tries at the node's place whatever they have
+    /// seen.
     pub(crate) fn forget_tries(&mut self, id: InstanceId) {
-        if let Some(node) = self.node_mut(id) {
+        if let Some(node) = self.node_mut(id).filter(|node| !node.is_at_its_place) {
             node.tries = 1;
+            node.not_before = Timestamp(0);
             // Only this instance has crashed on the mispredicted inputs.
             node.crashes = 0;
+        }
+    }
+
+    /// The node has come to its place in the sequential program.
+    pub(crate) fn come_to_its_place(&mut self, id: InstanceId) {
+        if let Some(node) = self.node_mut(id) {
+            node.is_at_its_place = true;
         }
     }
 
