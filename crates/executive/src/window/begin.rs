@@ -337,20 +337,13 @@ impl Window {
         self.start_goal(context, id, known);
     }
 
-    /// Ends a PIA with a precondition that no longer holds, because somebody else changed the world while it waited for its resources. True if it
-    /// ended.
+    /// Ends a node with a precondition that no longer holds, because another region or somebody else changed the world while it waited for its
+    /// resources. True if it ended. Of a node that runs ahead preconditions are checked later, in the actual world.
     fn is_not_met(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
-        let Some(instance) = self.graph.get(id).filter(|instance| instance.is_pia()) else { return false };
-        let state = context.program.state(instance.state);
-        if state.annotations.requires.is_empty() {
+        if !self.graph.get(id).is_some_and(Window::begins_for_real) {
             return false;
         }
-        let unmet = self.look(context, id, None, |_, view| match binding::unmet(state, view) {
-            Ok(None) => None,
-            Ok(Some(reason)) => Some(Readiness::Failed(reason)),
-            Err(error) => Some(not_bound(view, &error)),
-        });
-        match unmet.flatten() {
+        match self.unmet(context, id) {
             Some(Readiness::Failed(reason)) => {
                 let outputs = self.unassigned(context, id);
                 self.finish(context, id, Ended { outputs, ..Ended::aborted(reason) });
