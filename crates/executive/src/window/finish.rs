@@ -229,9 +229,9 @@ impl Window {
         }
     }
 
-    /// The run ends while a PIA is under way: commits its `preempted` effects.
+    /// The run ends while a node is under way at its place in the program: commits its `preempted` effects. What runs ahead leaves no trace.
     fn say_cut_short(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some(instance) = self.graph.get(id).filter(|instance| instance.is_pia()) else { return };
+        let Some(instance) = self.graph.get(id).filter(|instance| acts_for_real(instance)) else { return };
         let Some(declared) = context.program.state(instance.state).annotations.effects.get(PREEMPTED) else { return };
         let changes =
             self.look(context, id, None, |_, view| effects::actual(Some(declared), PREEMPTED, &[], view).ok());
@@ -338,4 +338,9 @@ impl Window {
         let changes = Changed::Exactly(routine.into_made());
         self.finish(context, id, Ended { outcome: outcome.into(), outputs, reason, changes, in_circles });
     }
+}
+
+/// Whether what a node does is real: it is a PIA, or has come to its place in the program.
+fn acts_for_real(instance: &Instance) -> bool {
+    instance.is_pia() || instance.node().is_some_and(|node| node.is_at_its_place)
 }
