@@ -5,7 +5,7 @@ use super::graph::instance::{Changed, Ended, Held, Instance, Status};
 use super::growth::environment::assigned;
 use super::waits::{Timer, Wait};
 use crate::binding;
-use crate::context::Context;
+use crate::context::{Context, Made};
 use crate::effects;
 use crate::interpreter::{DEFAULT_ATTEMPTS, Progress};
 use crate::plan::gives_outputs;
@@ -242,6 +242,15 @@ impl Window {
         }
     }
 
+    /// The run ends while a routine is under way: if it is at its place, what it has changed on its projection so far becomes real.
+    fn keep_what_was_made(&mut self, context: &mut Context<'_>, id: InstanceId, made: Made) {
+        if self.graph.get(id).is_some_and(acts_for_real) {
+            let writer = self.path(context.program, id);
+            // Errors do not matter: the run ends anyway.
+            let _ = context.commit(id, writer, made);
+        }
+    }
+
     /// Cancels or withdraws whatever is under way for a node; it holds nothing afterwards.
     pub(super) fn stop_node(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.harvest(context, id);
@@ -262,7 +271,12 @@ impl Window {
                 if let Some(interpreter) = self.graph.interpreter(id) {
                     interpreter.abort(context);
                 }
-                self.graph.end_routine(id);
+                let routine = self.graph.end_routine(id);
+                if self.is_ending
+                    && let Some(routine) = routine
+                {
+                    self.keep_what_was_made(context, id, routine.into_made());
+                }
             }
             Status::Expanded | Status::Granted(_) | Status::Finished(_) => {}
         }
