@@ -1,6 +1,7 @@
 //! Discarding instances: the branches that are not taken, and everything behind an outcome that was not computed ahead.
 
 use super::Window;
+use super::beside::is_in_order;
 use super::graph::Pruned;
 use super::graph::instance::{Instance, Node, Role, Status};
 use super::growth::environment::{Binding, Environment, assigned};
@@ -120,12 +121,23 @@ impl Window {
         }
     }
 
-    /// The entered states with a `finally`, by line: the oldest instance of a line is where the sequential program would be.
+    /// The instances at which the sequential program would be, one per thread of control: the oldest ones that are not real. Of a line that is
+    /// expanded past a running imprecise PIA this is that PIA, and the regions of a younger fork have not begun there.
+    fn places(&self) -> Vec<&Instance> {
+        let detached = self.graph.detached().iter().filter_map(|id| self.graph.get(*id));
+        // The sequential program has not begun a motion whose path was left.
+        let detached: Vec<&Instance> = detached.filter(|motion| !motion.is_orphan()).collect();
+        let is_after = |one: &Instance| detached.iter().any(|motion| motion.id < one.id && is_in_order(motion, one));
+        let all = detached.iter().copied().chain(self.graph.active_heads());
+        all.filter(|one| !is_after(one)).collect()
+    }
+
+    /// The entered states with a `finally`, by thread of control.
     fn way_out(&self, context: &Context<'_>) -> WayOut {
         let mut way = WayOut::default();
         let mut forks = BTreeSet::new();
         let sight = self.sight(context);
-        for head in self.graph.active_heads() {
+        for head in self.places() {
             let routine = self.status_of_routine(head.id);
             let within = routine.and_then(|routine| routine.way_out_within(context.program, &mut way));
             // A join or an exit comes after everything inside of its state, but the state is not left yet.
