@@ -100,8 +100,30 @@ impl Window {
         }
     }
 
+    /// Cancels what says of itself what being cut short changes, in the order of threads of control, as the sequential program does. Of one thread
+    /// the oldest comes last, because only that one is at its place in the sequential program.
+    fn say_what_is_cut_short(&mut self, context: &mut Context<'_>) {
+        let declares = |instance: &Instance| {
+            let declared = context.program.state(instance.state).annotations.effects.get(PREEMPTED);
+            declared.is_some_and(|declared| !declared.is_empty())
+        };
+        let says = |instance: &&Instance| match instance.node().map(|node| &node.status) {
+            Some(Status::RunningRoutine(..)) => true,
+            Some(Status::Running(_)) => declares(instance),
+            _ => false,
+        };
+        let order = |instance: &Instance| (instance.line, std::cmp::Reverse(instance.id));
+        let mut saying: Vec<_> = self.graph.iter().filter(says).map(order).collect();
+        saying.sort_unstable();
+        for (_, std::cmp::Reverse(id)) in saying {
+            self.stop_node(context, id);
+            self.graph.begin_again(id);
+        }
+    }
+
     fn discard_all(&mut self, context: &mut Context<'_>, outcome: &str, reason: String) {
         self.is_ending = true;
+        self.say_what_is_cut_short(context);
         let all: Vec<InstanceId> = self.graph.iter().map(|instance| instance.id).collect();
         for id in all.into_iter().rev() {
             self.discard_one(context, id);
