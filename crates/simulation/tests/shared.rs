@@ -1,6 +1,6 @@
 //! Random regions that share facts: what each decides, and computes, is by what the other has really done when it comes to its place, in both
-//! modes. They hold motions alone, of two units and with durations that are never over at the same moment: so both modes do the same at the
-//! same times, also where motions are imprecise, for each needs the unit that the one before it has.
+//! modes. They hold motions of two units, with durations that are never over at the same moment, and states that compute on what the motion before
+//! them gives: so both modes do the same at the same times, also where motions are imprecise, for each needs the unit that the one before it has.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
@@ -16,6 +16,8 @@ use support::{MODES, NoFiles, acts, facts, load};
 struct Writer {
     dice: u64,
     text: String,
+    /// What its providers do.
+    script: String,
     names: u64,
     actuator: usize,
 }
@@ -34,16 +36,20 @@ impl Writer {
         let _ = writeln!(self.text, "{}{line}", "  ".repeat(depth));
     }
 
-    fn motion(&mut self, depth: usize, inputs: &str, effect: &str) {
+    /// A number that no state has yet, and a duration in seconds: no sum of some of them is one of others.
+    fn number_and_duration(&mut self) -> (u64, f64) {
         self.names += 1;
         let number = self.names;
-        // No sum of some of them is one of others.
-        let duration =
-            0.3 + 0.17 * self.below(20) as f64 + 0.000_137 * number as f64 + 0.000_001_9 * (number * number) as f64;
+        let fraction = 0.000_137 * number as f64 + 0.000_001_9 * (number * number) as f64;
+        (number, 0.3 + 0.17 * self.below(20) as f64 + fraction)
+    }
+
+    fn motion(&mut self, depth: usize, inputs: &str, effect: &str) {
+        let (number, duration) = self.number_and_duration();
         let [of, unit] = [["arm/move", "Arm"], ["head/turn", "Head"]][self.actuator];
         let exceptions = if self.below(3) == 0 { "exceptions: imprecise, " } else { "" };
         let what = format!(
-            "pia: true, {exceptions}reads: [], {inputs}effects: ['{effect}'], resources: [{{ block: {unit} }}]"
+            "out: {{ x: any }}, pia: true, {exceptions}reads: [], {inputs}effects: ['{effect}'], resources: [{{ block: {unit} }}]"
         );
         self.line(depth, &format!("- m{number}: {{ action: {of}, {what}, duration: {duration:.7} }}"));
     }
@@ -59,6 +65,34 @@ impl Writer {
             3 => self.motion(depth, "", &format!("{own} = {fact}")),
             _ => self.motion(depth, &format!("in: {{ a: {fact} }}, "), &format!("{own} = 1")),
         }
+    }
+
+    /// A state that computes on what the motion before it gives: it may require something of what is shared, and may be tried again. Where it
+    /// leads is said.
+    fn computed(&mut self, depth: usize, region: &str) {
+        let own = format!("said{}()", self.names + 1);
+        self.motion(depth, "", &format!("{own} = 1"));
+        let before = self.names;
+        let (number, duration) = self.number_and_duration();
+        let (_, backoff) = self.number_and_duration();
+        let (read, required, limit) = (self.fact(), self.fact(), self.below(4));
+        let requires = if self.below(2) == 0 { format!("requires: ['{required} < {limit}'], ") } else { String::new() };
+        let retry =
+            if self.below(2) == 0 { format!("retry: {{ times: 1, backoff: {backoff:.7} }}, ") } else { String::new() };
+        let what = format!(
+            "action: brain/think, in: {{ a: m{before}.x }}, computes: true, reads: ['{read}'], {requires}{retry}resources: \
+             [{{ block: Brain }}], duration: {duration:.7}, transitions: {{ aborted: otherwise{number} }}"
+        );
+        self.line(depth, &format!("- think{number}: {{ {what} }}"));
+        self.line(depth, &format!("- goes_on{number}: {{ states: [], transitions: {{ success: behind{number} }} }}"));
+        self.line(depth, &format!("- otherwise{number}: {{ states: [], effects: ['gave_up{number}()'] }}"));
+        self.line(depth, &format!("- behind{number}: {{ states: [] }}"));
+        let outcomes = match self.below(3) {
+            0 => "[\"success\"]",
+            1 => "[\"aborted\", \"success\"]",
+            _ => "[\"aborted\", \"aborted\", \"success\"]",
+        };
+        let _ = writeln!(self.script, "\"both/{region}/think{number}\" = {outcomes}");
     }
 
     fn part(&mut self, depth: usize, within: u64) {
@@ -116,9 +150,10 @@ impl Writer {
     }
 }
 
-fn task(seed: u64) -> String {
-    let mut writer =
-        Writer { dice: seed.wrapping_mul(0x9e37_79b9_7f4a_7c15), text: String::new(), names: 0, actuator: 0 };
+/// A task and its script.
+fn task(seed: u64) -> (String, String) {
+    let dice = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    let mut writer = Writer { dice, text: String::new(), script: "[outcomes]\n".to_owned(), names: 0, actuator: 0 };
     writer.line(0, "task: t\nworld: ['f0() = 0', 'f1() = 1', 'f2() = 2']\nstates:\n  - both:");
     writer.line(3, "concurrency: barrier");
     writer.line(3, "regions:");
@@ -128,14 +163,18 @@ fn task(seed: u64) -> String {
         writer.line(6, "shared: ['f0()', 'f1()', 'f2()']");
         writer.line(6, "states:");
         for _ in 0..4 {
-            writer.part(7, 2);
+            if writer.below(4) == 0 {
+                writer.computed(7, region);
+            } else {
+                writer.part(7, 2);
+            }
         }
     }
     writer.line(1, "- all:");
     writer.line(3, "outputs: { v: { value: 'f0() + 10 * f1() + 100 * f2()' } }");
     writer.line(3, "states: []");
     writer.motion(1, "", "found() = all.v");
-    writer.text
+    (writer.text, writer.script)
 }
 
 #[test]
@@ -143,16 +182,17 @@ fn regions_that_share_facts_end_alike_in_both_modes() {
     let first: u64 = std::env::var("RATN_FIRST").map_or(0, |first| first.parse().unwrap());
     let count: u64 = std::env::var("RATN_PROGRAMS").map_or(150, |count| count.parse().unwrap());
     for seed in first..first + count {
-        let text = task(seed);
+        let (text, script) = task(seed);
         let program = load(&text, "task.yaml", &NoFiles);
         let end = |mode: Mode| {
-            let run: Run =
-                Script::default().run(&program, mode).unwrap_or_else(|problem| panic!("{seed}: {problem}\n{text}"));
+            let run: Run = Script::from_toml(&script)
+                .run(&program, mode)
+                .unwrap_or_else(|problem| panic!("{seed}: {problem}\n{text}"));
             let acts = acts(&program, &run);
             (run.outcome.clone(), run.reason.clone(), facts(&run), acts)
         };
         let [hsm, cdtn] = MODES.map(end);
         assert_eq!(hsm.0, "success", "{seed}: {}\n{text}", hsm.1);
-        assert_eq!(hsm, cdtn, "{seed}\n{text}");
+        assert_eq!(hsm, cdtn, "{seed}\n{text}\n{script}");
     }
 }

@@ -167,7 +167,7 @@ impl Interpreter {
         self.leave_preempted(context, MAIN, (InstanceId(0), state), path)
     }
 
-    /// Adds the `finally` blocks that remain when everything under way in the actual world is cut short.
+    /// Adds the `finally` blocks that remain when everything under way is cut short.
     pub(crate) fn way_out(&self, program: &Program, way: &mut WayOut) {
         if let Some(Within { places, variables, outputs }) = self.way_out_within(program, way) {
             way.add(program, places.into_iter(), || variables, || outputs);
@@ -176,11 +176,8 @@ impl Interpreter {
     }
 
     /// The same for the regions' threads; returns the place of the main thread, because the states around a routine of the window belong to the
-    /// same thread of control. `None` on a projection, where nothing is real.
+    /// same thread of control.
     pub(crate) fn way_out_within(&self, program: &Program, way: &mut WayOut) -> Option<Within> {
-        if !matches!(self.target, Target::Actual) {
-            return None;
-        }
         let within = |thread: &Thread| Within {
             places: places(program, thread),
             variables: thread.variables.iter().map(|(name, value)| (name.clone(), (**value).clone())).collect(),

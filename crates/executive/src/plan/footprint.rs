@@ -125,7 +125,7 @@ pub(super) fn senses(subject: &Subject<'_>) -> Vec<FactExpr> {
 }
 
 /// The facts for which a node tolerates no deviation. An action, also inside of a routine, ignores tolerated deviations of what it reads; its
-/// assignments are exact, and so is everything that a routine computes itself. The node's preconditions are checked when it retires.
+/// assignments are exact, and so is everything that a routine computes itself. The node's preconditions are checked in the actual world, too.
 pub(super) fn exact(subject: &Subject<'_>) -> Vec<FactExpr> {
     let is_exact = |state: &State, slot: Slot<'_>| match slot {
         Slot::Assign(_) => true,

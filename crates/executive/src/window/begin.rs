@@ -25,6 +25,7 @@ impl Window {
     /// Begins a node, or notes what it waits for.
     pub(super) fn begin(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.follow_root(context);
+        self.come_to_its_place(context, id);
         let looked = self.look(context, id, None, |instance, view| {
             let mut seen = Seen::default();
             let readiness = self.readiness(context, instance, view, &mut seen);
@@ -151,15 +152,14 @@ impl Window {
         let seed = self.seed(context, instance);
         let Some(seen) = instance.seen() else { return false };
         match self.results.find(&self.graph, id, seed, seen) {
-            Some(Known::Result(mut ended)) => {
+            Some(Known::Result(mut answer)) => {
                 // Assigned values may depend on facts that differ between the branches.
-                ended.outputs.retain(|port, _| !port.starts_with(super::growth::environment::ASSIGNED));
-                if let Err(problem) = self.assign(context, id, &mut ended) {
-                    *ended = Ended { changes: ended.changes.clone(), ..Ended::aborted(problem) };
-                }
+                answer.outputs.retain(|port, _| !port.starts_with(super::growth::environment::ASSIGNED));
+                self.graph.answer(id, (*answer).clone());
+                let ended = self.end_of_answer(context, id, *answer);
                 context.note(Note::Reused { instance: id });
                 context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
-                self.end_instance(id, *ended);
+                self.end_instance(id, ended);
                 true
             }
             Some(Known::Busy(busy)) => {
@@ -179,15 +179,21 @@ impl Window {
     /// Keeps a result in the cache before it is discarded.
     pub(super) fn keep_result(&mut self, context: &Context<'_>, id: InstanceId) {
         let Some(instance) = self.graph.get(id) else { return };
-        let (Some(seen), Some(ended)) = (instance.seen(), instance.ended()) else { return };
-        // A node that failed to begin has no result.
-        let is_none = !ended.reason.is_empty() && ended.outputs.is_empty();
-        if !is_cacheable(context, instance) || self.is_ending || is_none {
+        let answer = instance.node().and_then(|node| node.answer.clone());
+        let (Some(seen), Some(answer)) = (instance.seen(), answer) else { return };
+        if self.is_ending {
             return;
         }
-        let (seed, seen, ended) = (self.seed(context, instance), seen.clone(), ended.clone());
-        self.results.keep(seed, seen, ended);
+        let (seed, seen) = (self.seed(context, instance), seen.clone());
+        self.results.keep(seed, seen, answer);
         self.wake_twins(id);
+    }
+
+    /// Keeps the answer of a goal, if it is a result that other instances may use.
+    pub(super) fn keep_answer(&mut self, context: &Context<'_>, id: InstanceId, answer: &Ended) {
+        if self.graph.get(id).is_some_and(|instance| is_cacheable(context, instance)) {
+            self.graph.answer(id, answer.clone());
+        }
     }
 
     /// The random seed of a visit.
@@ -331,20 +337,13 @@ impl Window {
         self.start_goal(context, id, known);
     }
 
-    /// Ends a PIA with a precondition that no longer holds, because somebody else changed the world while it waited for its resources. True if it
-    /// ended.
+    /// Ends a node with a precondition that no longer holds, because another region or somebody else changed the world while it waited for its
+    /// resources. True if it ended. Of a node that runs ahead preconditions are checked later, in the actual world.
     fn is_not_met(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
-        let Some(instance) = self.graph.get(id).filter(|instance| instance.is_pia()) else { return false };
-        let state = context.program.state(instance.state);
-        if state.annotations.requires.is_empty() {
+        if !self.graph.get(id).is_some_and(Window::begins_for_real) {
             return false;
         }
-        let unmet = self.look(context, id, None, |_, view| match binding::unmet(state, view) {
-            Ok(None) => None,
-            Ok(Some(reason)) => Some(Readiness::Failed(reason)),
-            Err(error) => Some(not_bound(view, &error)),
-        });
-        match unmet.flatten() {
+        match self.unmet(context, id) {
             Some(Readiness::Failed(reason)) => {
                 let outputs = self.unassigned(context, id);
                 self.finish(context, id, Ended { outputs, ..Ended::aborted(reason) });

@@ -1,6 +1,7 @@
 //! Discarding instances: the branches that are not taken, and everything behind an outcome that was not computed ahead.
 
 use super::Window;
+use super::beside::is_in_order;
 use super::graph::Pruned;
 use super::graph::instance::{Instance, Node, Role, Status};
 use super::growth::environment::{Binding, Environment, assigned};
@@ -99,8 +100,30 @@ impl Window {
         }
     }
 
+    /// Cancels what says of itself what being cut short changes, in the order of threads of control, as the sequential program does. Of one thread
+    /// the oldest comes last, because only that one is at its place in the sequential program.
+    fn say_what_is_cut_short(&mut self, context: &mut Context<'_>) {
+        let declares = |instance: &Instance| {
+            let declared = context.program.state(instance.state).annotations.effects.get(PREEMPTED);
+            declared.is_some_and(|declared| !declared.is_empty())
+        };
+        let says = |instance: &&Instance| match instance.node().map(|node| &node.status) {
+            Some(Status::RunningRoutine(..)) => true,
+            Some(Status::Running(_)) => declares(instance),
+            _ => false,
+        };
+        let order = |instance: &Instance| (instance.line, std::cmp::Reverse(instance.id));
+        let mut saying: Vec<_> = self.graph.iter().filter(says).map(order).collect();
+        saying.sort_unstable();
+        for (_, std::cmp::Reverse(id)) in saying {
+            self.stop_node(context, id);
+            self.graph.begin_again(id);
+        }
+    }
+
     fn discard_all(&mut self, context: &mut Context<'_>, outcome: &str, reason: String) {
         self.is_ending = true;
+        self.say_what_is_cut_short(context);
         let all: Vec<InstanceId> = self.graph.iter().map(|instance| instance.id).collect();
         for id in all.into_iter().rev() {
             self.discard_one(context, id);
@@ -120,12 +143,23 @@ impl Window {
         }
     }
 
-    /// The entered states with a `finally`, by line: the oldest instance of a line is where the sequential program would be.
+    /// The instances at which the sequential program would be, one per thread of control: the oldest ones that are not real. Of a line that is
+    /// expanded past a running imprecise PIA this is that PIA, and the regions of a younger fork have not begun there.
+    fn places(&self) -> Vec<&Instance> {
+        let detached = self.graph.detached().iter().filter_map(|id| self.graph.get(*id));
+        // The sequential program has not begun a motion whose path was left.
+        let detached: Vec<&Instance> = detached.filter(|motion| !motion.is_orphan()).collect();
+        let is_after = |one: &Instance| detached.iter().any(|motion| motion.id < one.id && is_in_order(motion, one));
+        let all = detached.iter().copied().chain(self.graph.active_heads());
+        all.filter(|one| !is_after(one)).collect()
+    }
+
+    /// The entered states with a `finally`, by thread of control.
     fn way_out(&self, context: &Context<'_>) -> WayOut {
         let mut way = WayOut::default();
         let mut forks = BTreeSet::new();
         let sight = self.sight(context);
-        for head in self.graph.active_heads() {
+        for head in self.places() {
             let routine = self.status_of_routine(head.id);
             let within = routine.and_then(|routine| routine.way_out_within(context.program, &mut way));
             // A join or an exit comes after everything inside of its state, but the state is not left yet.

@@ -5,7 +5,7 @@ use super::graph::instance::{Changed, Ended, Held, Instance, Status};
 use super::growth::environment::assigned;
 use super::waits::{Timer, Wait};
 use crate::binding;
-use crate::context::Context;
+use crate::context::{Context, Made};
 use crate::effects;
 use crate::interpreter::{DEFAULT_ATTEMPTS, Progress};
 use crate::plan::gives_outputs;
@@ -33,7 +33,9 @@ impl Window {
                 let own = context.plan.state(instance.state);
                 let known = own.outcome(&outcome).map(|number| own.outcomes[number].clone());
                 let outcome = known.unwrap_or_else(|| outcome.into());
-                self.goal_ended(context, id, Ended { outcome, outputs, reason, changes, in_circles: false });
+                let answer = Ended { outcome, outputs, reason, changes, in_circles: false };
+                self.keep_answer(context, id, &answer);
+                self.goal_ended(context, id, answer);
             }
             (
                 Event::Crashed { reason, unknown, .. },
@@ -103,8 +105,20 @@ impl Window {
     }
 
     /// A node's result is known: gives back its resources.
-    pub(super) fn finish(&mut self, context: &mut Context<'_>, id: InstanceId, mut ended: Ended) {
-        let Some(instance) = self.graph.get(id) else { return };
+    pub(super) fn finish(&mut self, context: &mut Context<'_>, id: InstanceId, ended: Ended) {
+        let ended = self.end_of_answer(context, id, ended);
+        context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
+        let has_acted = self.graph.node(id).is_some_and(|node| node.status.is_running());
+        self.give_back(context, id);
+        self.graph.set_acted(id, has_acted);
+        self.rest(id);
+        self.end_node(context, id, ended);
+    }
+
+    /// The end of a node whose goal has answered so: with the values that it assigns, or `aborted` if the answer is no valid one or a value cannot be
+    /// evaluated.
+    pub(super) fn end_of_answer(&self, context: &Context<'_>, id: InstanceId, mut ended: Ended) -> Ended {
+        let Some(instance) = self.graph.get(id) else { return ended };
         let state = context.program.state(instance.state);
         let own = context.plan.state(instance.state);
         let failed =
@@ -125,12 +139,7 @@ impl Window {
         if let Err(problem) = self.assign(context, id, &mut ended) {
             ended = failed(&ended, problem);
         }
-        context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
-        let has_acted = instance.node().is_some_and(|node| node.status.is_running());
-        self.give_back(context, id);
-        self.graph.set_acted(id, has_acted);
-        self.rest(id);
-        self.end_node(context, id, ended);
+        ended
     }
 
     /// Ends a node that holds nothing any more. A detached PIA, which its line has already passed, retires at once.
@@ -220,9 +229,9 @@ impl Window {
         }
     }
 
-    /// The run ends while a PIA is under way: commits its `preempted` effects.
+    /// The run ends while a node is under way at its place in the program: commits its `preempted` effects. What runs ahead leaves no trace.
     fn say_cut_short(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some(instance) = self.graph.get(id).filter(|instance| instance.is_pia()) else { return };
+        let Some(instance) = self.graph.get(id).filter(|instance| acts_for_real(instance)) else { return };
         let Some(declared) = context.program.state(instance.state).annotations.effects.get(PREEMPTED) else { return };
         let changes =
             self.look(context, id, None, |_, view| effects::actual(Some(declared), PREEMPTED, &[], view).ok());
@@ -230,6 +239,15 @@ impl Window {
             let writer = self.path(context.program, id);
             // Errors do not matter: the run ends anyway.
             let _ = context.commit(id, writer, changes.into());
+        }
+    }
+
+    /// The run ends while a routine is under way: if it is at its place, what it has changed on its projection so far becomes real.
+    fn keep_what_was_made(&mut self, context: &mut Context<'_>, id: InstanceId, made: Made) {
+        if self.graph.get(id).is_some_and(acts_for_real) {
+            let writer = self.path(context.program, id);
+            // Errors do not matter: the run ends anyway.
+            let _ = context.commit(id, writer, made);
         }
     }
 
@@ -253,7 +271,12 @@ impl Window {
                 if let Some(interpreter) = self.graph.interpreter(id) {
                     interpreter.abort(context);
                 }
-                self.graph.end_routine(id);
+                let routine = self.graph.end_routine(id);
+                if self.is_ending
+                    && let Some(routine) = routine
+                {
+                    self.keep_what_was_made(context, id, routine.into_made());
+                }
             }
             Status::Expanded | Status::Granted(_) | Status::Finished(_) => {}
         }
@@ -329,4 +352,9 @@ impl Window {
         let changes = Changed::Exactly(routine.into_made());
         self.finish(context, id, Ended { outcome: outcome.into(), outputs, reason, changes, in_circles });
     }
+}
+
+/// Whether what a node does is real: it is a PIA, or has come to its place in the program.
+fn acts_for_real(instance: &Instance) -> bool {
+    instance.is_pia() || instance.node().is_some_and(|node| node.is_at_its_place)
 }

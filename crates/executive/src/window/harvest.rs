@@ -47,7 +47,9 @@ impl Window {
         let senses = if instance.is_sensing() { self.senses(context, instance) } else { Footprint::NOTHING };
         let held = self.graph.take_held(id);
         self.improving.begin(id, Improvement { state, attempt, held, senses, producer, best: None });
-        self.finish(context, id, Ended::with(SUCCESS, outputs));
+        let answer = Ended::with(SUCCESS, outputs);
+        self.keep_answer(context, id, &answer);
+        self.finish(context, id, answer);
         if self.graph.get(id).is_some_and(|instance| instance.outputs().is_none()) {
             // The values that it assigns could not be evaluated.
             return self.harvest(context, id);

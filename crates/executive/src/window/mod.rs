@@ -16,6 +16,7 @@
 //! | what happens | |
 //! |---|---|
 //! | `ready`, `begin` | a node may begin, asks for its resources, gets its projection, runs |
+//! | `place` | a computing or sensing node that runs ahead comes to its place in the sequential program |
 //! | `waiting` | a state waits, without a provider |
 //! | `finish` | a goal ends, a worker dies, a node is tried again |
 //! | `harvest` | an anytime result is improved until it is used or its resources are wanted |
@@ -43,6 +44,7 @@ mod harvest;
 mod improving;
 mod memory;
 mod outside;
+mod place;
 mod ready;
 mod results;
 mod retire;

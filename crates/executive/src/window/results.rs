@@ -2,7 +2,8 @@
 //! computation is asked for.
 //!
 //! The key of a result is its seed (run, path with visits, and try) and its inputs: with equal seed, input ports and facts the
-//! result is the same.
+//! result is the same. A result is what the goal answered. What happens to an instance before its goal begins (its resources are refused), after
+//! its goal has ended (a value that it assigns cannot be evaluated), or instead of an answer (a timeout, a dead worker) is its own.
 
 use super::graph::Graph;
 use super::graph::instance::Ended;
@@ -17,7 +18,7 @@ const MAX_RESULTS: usize = 1024;
 /// Results by seed, and the instances that compute them.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Results {
-    kept: BTreeMap<u64, Vec<(Seen, Ended)>>,
+    kept: BTreeMap<u64, Vec<(Seen, Box<Ended>)>>,
     order: VecDeque<u64>,
     /// Speculative instances that compute or have computed a result, by seed and by id.
     twins: BTreeMap<u64, Vec<InstanceId>>,
@@ -42,8 +43,8 @@ impl Results {
     pub(crate) fn find(&self, graph: &Graph, id: InstanceId, seed: u64, seen: &Seen) -> Option<Known> {
         let same = |other: &Seen| other.is_like(seen);
         let kept = self.kept.get(&seed).and_then(|all| all.iter().find(|(other, _)| same(other)));
-        if let Some((_, ended)) = kept {
-            return Some(Known::Result(Box::new(ended.clone())));
+        if let Some((_, answer)) = kept {
+            return Some(Known::Result(answer.clone()));
         }
         let mut busy = None;
         for other in self.twins.get(&seed).into_iter().flatten().filter(|other| **other != id) {
@@ -51,8 +52,8 @@ impl Results {
             if !other.seen().is_some_and(same) {
                 continue;
             }
-            match other.ended() {
-                Some(ended) => return Some(Known::Result(Box::new(ended.clone()))),
+            match other.node().and_then(|node| node.answer.as_ref()) {
+                Some(answer) => return Some(Known::Result(answer.clone())),
                 None if other.is_under_way() => busy = Some(Known::Busy(other.id)),
                 None => {}
             }
@@ -96,8 +97,8 @@ impl Results {
     }
 
     /// Keeps a result that is about to be discarded.
-    pub(crate) fn keep(&mut self, seed: u64, seen: Seen, ended: Ended) {
-        self.kept.entry(seed).or_default().push((seen, ended));
+    pub(crate) fn keep(&mut self, seed: u64, seen: Seen, answer: Box<Ended>) {
+        self.kept.entry(seed).or_default().push((seen, answer));
         self.order.push_back(seed);
         if self.order.len() > MAX_RESULTS
             && let Some(oldest) = self.order.pop_front()

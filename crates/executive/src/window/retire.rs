@@ -5,7 +5,7 @@
 //! state, and the end of a region, wait for such PIAs inside.
 
 use super::Window;
-use super::graph::instance::{Changed, Ended, Instance, Role, Status};
+use super::graph::instance::{Changed, Ended, Instance, Node, Role, Status};
 use super::growth::Departure;
 use super::memory::{Difference, Source, User};
 use super::waits::Wait;
@@ -63,6 +63,7 @@ impl Window {
                     retired = true;
                     continue;
                 }
+                self.come_to_its_place(context, id);
                 let has_ended = self.graph.get(id).is_some_and(|head| head.ended().is_some());
                 if !has_ended || !self.retire_head(context, id) {
                     break;
@@ -282,9 +283,10 @@ impl Window {
         };
         let state = context.program.state(instance.state);
         let own = context.plan.state(instance.state);
-        // Preconditions were checked on a projection, if at all; now the actual world decides.
+        // Preconditions of what has ended before it came to its place were checked on a projection, if at all; now the actual world decides.
+        let has_run_ahead = |node: &Node| node.nature != NodeNature::Irreversible && !node.is_at_its_place;
         let checks = match instance.role() {
-            None => instance.node().is_some_and(|node| node.nature != NodeNature::Irreversible),
+            None => instance.node().is_some_and(has_run_ahead),
             Some(Role::Entry) => ended.outcome.as_ref() == SUCCESS,
             Some(_) => false,
         };

@@ -79,10 +79,15 @@ pub(crate) struct Node {
     pub(crate) not_before: Timestamp,
     /// The inputs of its result.
     pub(crate) seen: Option<Box<Seen>>,
+    /// The answer of its goal, before its assignments: what another instance with the same inputs would be answered, too. `None` if it ended
+    /// without an answer, and for nodes that do not compute.
+    pub(crate) answer: Option<Box<Ended>>,
     /// Whether its goal was under way when it ended.
     pub(crate) has_acted: bool,
     /// Whether it is an imprecise PIA that runs while younger instances of its line go on.
     pub(crate) is_detached: bool,
+    /// Of a computing or sensing node: whether it has come to its place in the sequential program before it ended.
+    pub(crate) is_at_its_place: bool,
 }
 
 /// The status of a node. Retired and discarded nodes are no longer in the window.

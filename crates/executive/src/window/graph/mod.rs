@@ -384,6 +384,7 @@ impl Graph {
             Body::Node(node) => {
                 node.status = Status::Expanded;
                 node.seen = None;
+                node.answer = None;
                 node.attempt += 1;
             }
             Body::Marker(marker) => (marker.ended, marker.seen) = (None, None),

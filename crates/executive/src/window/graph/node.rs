@@ -1,7 +1,7 @@
 //! The life of a node: every change of its status, with the data that the status owns.
 
 use super::Graph;
-use super::instance::{Body, Held, Instance, Node, Status};
+use super::instance::{Body, Ended, Held, Instance, Node, Status};
 use crate::binding::Outputs;
 use crate::interpreter::Interpreter;
 use ratn_model::id::{InstanceId, ProjectionId};
@@ -95,9 +95,19 @@ impl Graph {
         self.node_mut(id).map(|node| node.status.take_held()).unwrap_or_default()
     }
 
+    /// Keeps the answer of the node's goal for other instances with the same inputs.
+    pub(crate) fn answer(&mut self, id: InstanceId, answer: Ended) {
+        if let Some(node) = self.node_mut(id) {
+            node.answer = Some(Box::new(answer));
+        }
+    }
+
     /// Replaces the result by a better one; nobody has used the outputs that differ.
     pub(crate) fn improve(&mut self, id: InstanceId, outputs: Outputs) {
-        if let Some(Node { status: Status::Finished(ended), .. }) = self.node_mut(id) {
+        if let Some(Node { status: Status::Finished(ended), answer, .. }) = self.node_mut(id) {
+            if let Some(answer) = answer {
+                answer.outputs.clone_from(&outputs);
+            }
             ended.outputs = outputs;
         }
     }
@@ -106,6 +116,7 @@ impl Graph {
     pub(crate) fn begin_again(&mut self, id: InstanceId) {
         if let Some(node) = self.node_mut(id) {
             node.status = Status::Expanded;
+            node.answer = None;
             node.attempt += 1;
         }
     }
@@ -119,12 +130,21 @@ impl Graph {
         }
     }
 
-    /// The count of tries begins again, because the inputs have changed.
+    /// The count of tries begins again, because the inputs have changed. The sequential program counts tries at the node's place whatever they have
+    /// seen.
     pub(crate) fn forget_tries(&mut self, id: InstanceId) {
-        if let Some(node) = self.node_mut(id) {
+        if let Some(node) = self.node_mut(id).filter(|node| !node.is_at_its_place) {
             node.tries = 1;
+            node.not_before = Timestamp(0);
             // Only this instance has crashed on the mispredicted inputs.
             node.crashes = 0;
+        }
+    }
+
+    /// The node has come to its place in the sequential program.
+    pub(crate) fn come_to_its_place(&mut self, id: InstanceId) {
+        if let Some(node) = self.node_mut(id) {
+            node.is_at_its_place = true;
         }
     }
 

@@ -64,8 +64,10 @@ impl Growth {
                 crashes: 0,
                 not_before: Timestamp(0),
                 seen: None,
+                answer: None,
                 has_acted: false,
                 is_detached: false,
+                is_at_its_place: false,
             }),
             What::Marker(role, leaves_by) => {
                 Body::Marker(Marker { role, leaves_by, because: cursor.because.clone(), ended: None, seen: None })
