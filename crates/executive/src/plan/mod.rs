@@ -114,7 +114,7 @@ pub(crate) struct StatePlan {
     /// Of a node: facts that its result states or depends on exactly. For these it is computed again even if a deviation from the prediction is
     /// within the tolerance.
     pub(crate) exact: Vec<FactExpr>,
-    /// The facts that are looked up when it ends, whatever its outcome: by its effects and its resource operations.
+    /// The facts that are looked up when it ends, whatever its outcome: by its effects, its resource operations and the ontology.
     pub(crate) looked_up_at_end: Vec<FactExpr>,
     /// The effects that it may have, including its parts, if it does not end by an unhandled failure. `None`: it may write every fact.
     pub(crate) may_write: Option<Vec<EffectExpr>>,
