@@ -13,6 +13,7 @@
 
 pub mod turtle;
 
+use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::fact::{Change, FactKey, FactPattern, Term};
 use crate::load::suggestion;
 use crate::measurement::{Certainty, Measurement};
@@ -139,6 +140,20 @@ impl Ontology {
         let mut rivals = FactPattern::of(fact);
         *rivals.arguments.last_mut()? = None;
         Some(rivals)
+    }
+
+    /// The facts that must not hold together with those that an effect sets (see [`Ontology::rivals`]), before the effect is bound.
+    pub fn rivals_of(&self, effect: &EffectExpr) -> Vec<FactExpr> {
+        match effect {
+            EffectExpr::Set(_, Expr::Literal(Value::Null | Value::Bool(false))) => Vec::new(),
+            EffectExpr::Set(fact, _) if self.predicate(&fact.predicate).is_some_and(|own| own.functional) => {
+                let mut rivals = fact.clone();
+                rivals.arguments.last_mut().into_iter().for_each(|last| *last = None);
+                vec![rivals]
+            }
+            EffectExpr::Set(..) | EffectExpr::Delete(_) | EffectExpr::Increase(..) => Vec::new(),
+            EffectExpr::ForEach { effects, .. } => effects.iter().flat_map(|inner| self.rivals_of(inner)).collect(),
+        }
     }
 
     /// Whether an individual is of a class: as declared or by its name, directly or through subclasses.

@@ -191,6 +191,33 @@ fn the_examples_say_only_what_their_ontology_allows() {
 }
 
 #[test]
+fn two_regions_change_facts_of_one_subject_of_a_functional_predicate_only_if_all_of_these_are_shared() {
+    let is_refused = |first: &str, second: &str, shared: &str| {
+        let task = format!(
+            "task: t\nontology: aimm.ttl\nstates:\n  - both:\n      concurrency: barrier\n      regions:\n        - left: {{ action: gripper/release, pia: true, reads: [], effects: ['{first}'], shared: [{shared}], resources: [{{ block: Gripper }}] }}\n        - right: {{ action: pan_tilt/look_at, in: {{ target: \"pose(1, 0, 0)\" }}, pia: true, reads: [], effects: ['{second}'], resources: [{{ block: PanTilt }}] }}\n"
+        );
+        match load_with(&task, "task.yaml", &Catalogue::standard(), &Example) {
+            Ok(_) => false,
+            Err(found) => {
+                assert!(found.iter().all(|finding| finding.rule == "region-conflict"), "{found:#?}");
+                true
+            }
+        }
+    };
+    for (first, second, shared, expected) in [
+        ("on(box_1, table)", "not on(box_1, place_1)", "", true),
+        ("not on(box_1, place_1)", "on(box_1, table)", "", true),
+        ("on(box_1, table)", "on(box_1, place_1)", "", true),
+        ("on(box_1, table)", "not on(box_1, place_1)", "'on(box_1, table)'", true),
+        ("on(box_1, table)", "not on(box_1, place_1)", "'on(box_1, ?)'", false),
+        ("not on(box_1, table)", "not on(box_1, place_1)", "", false),
+        ("on(box_1, table)", "not on(box_2, place_1)", "", false),
+    ] {
+        assert_eq!(is_refused(first, second, shared), expected, "{first} beside {second}, shared: {shared}");
+    }
+}
+
+#[test]
 fn what_a_predicate_says_beside_its_value_is_read_and_counts() {
     let shop = ontology(
         ":Box a owl:Class ; ratn:named \"box_\" .

@@ -1,7 +1,7 @@
 //! Golden scenarios: one folder in `tests/scenarios` per rule of the window and per element of control flow.
 //!
-//! `task.yaml` is the task, its description the rule. `script.toml` says what the providers and the user do (`support/script.rs`).
-//! `transcript.txt` is what must come of it, in both modes: what the environment and the workers see, and what became of what was
+//! `task.yaml` is the task, its description the rule; an ontology that it names is a file beside it. `script.toml` says what the providers
+//! and the user do (`support/script.rs`). `transcript.txt` is what must come of it, in both modes: what the environment and the workers see, and what became of what was
 //! computed. `UPDATE=1 cargo test -p ratn-simulation --test golden` writes it anew: read the difference before it is committed.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
@@ -11,6 +11,7 @@ mod support;
 use ratn_executive::protocol::{Command, Event, LogEntry, Mode, Note};
 use ratn_model::fact::FactKey;
 use ratn_model::id::InstanceId;
+use ratn_model::load::Files;
 use ratn_model::program::Program;
 use ratn_model::resource::Quantity;
 use ratn_model::value::Value;
@@ -30,11 +31,21 @@ struct Scenario {
     runs: Vec<(&'static str, Result<Run, RunError>, Script)>,
 }
 
+/// The other files of a task are beside it.
+struct Beside<'a>(&'a Path);
+
+impl Files for Beside<'_> {
+    fn read(&self, _: &str, path: &str) -> Result<(String, String), String> {
+        let text = std::fs::read_to_string(self.0.join(path)).map_err(|error| format!("{path}: {error}"))?;
+        Ok((path.to_owned(), text))
+    }
+}
+
 impl Scenario {
     fn of(folder: PathBuf) -> Scenario {
         let file = folder.join("task.yaml");
         let task = std::fs::read_to_string(&file).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
-        let program = load(&task, &file.display().to_string(), &NoFiles);
+        let program = load(&task, &file.display().to_string(), &Beside(&folder));
         let script = Script::from_toml(&std::fs::read_to_string(folder.join("script.toml")).unwrap_or_default());
         let wanted = |name: &str| script.modes.is_empty() || script.modes.iter().any(|wanted| wanted == name);
         let modes = [("hsm", Mode::Hsm), ("cdtn", Mode::Cdtn)].into_iter().filter(|(name, _)| wanted(name));

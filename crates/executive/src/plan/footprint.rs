@@ -146,9 +146,15 @@ pub(super) fn exact(subject: &Subject<'_>) -> Vec<FactExpr> {
     all
 }
 
-/// The facts that the effects of a state look up, whatever its outcome.
-pub(super) fn effect_lookups(state: &State) -> Vec<FactExpr> {
-    state.annotations.effects.values().flat_map(|effects| EffectExpr::fact_expressions(effects)).cloned().collect()
+/// The facts that are looked up when a state ends, whatever its outcome: by its effects, by its resource operations, and by the ontology, which
+/// allows only one fact of a functional predicate for each subject.
+pub(super) fn looked_up_at_end(subject: &Subject<'_>, operations: &[ResourceExpr]) -> Vec<FactExpr> {
+    let effects = || subject.state.annotations.effects.values();
+    let by_effects = effects().flat_map(|effects| EffectExpr::fact_expressions(effects));
+    let by_operations = operations.iter().flat_map(ResourceExpr::expressions).flat_map(Expr::fact_expressions);
+    let ontology = subject.program.ontology.iter();
+    let rivals = ontology.flat_map(|ontology| effects().flatten().flat_map(|effect| ontology.rivals_of(effect)));
+    by_effects.chain(by_operations).cloned().chain(rivals).collect()
 }
 
 /// The effects of every outcome with which the nodes inside of a state may end while the state goes on or ends well. `None`: it may write every

@@ -114,8 +114,8 @@ pub(crate) struct StatePlan {
     /// Of a node: facts that its result states or depends on exactly. For these it is computed again even if a deviation from the prediction is
     /// within the tolerance.
     pub(crate) exact: Vec<FactExpr>,
-    /// The facts that its effects look up, whatever its outcome.
-    pub(crate) effect_lookups: Vec<FactExpr>,
+    /// The facts that are looked up when it ends, whatever its outcome: by its effects, its resource operations and the ontology.
+    pub(crate) looked_up_at_end: Vec<FactExpr>,
     /// The effects that it may have, including its parts, if it does not end by an unhandled failure. `None`: it may write every fact.
     pub(crate) may_write: Option<Vec<EffectExpr>>,
     /// Of a node that waits: the facts that regions beside it may change meanwhile.
@@ -251,7 +251,7 @@ impl StatePlan {
             reads: footprint::reads(subject, &resources.requirements),
             senses: footprint::senses(subject),
             exact: footprint::exact(subject),
-            effect_lookups: footprint::effect_lookups(state),
+            looked_up_at_end: footprint::looked_up_at_end(subject, &resources.operations),
             may_write,
             awaited,
             writes: writes.into_iter().collect(),

@@ -228,8 +228,7 @@ impl Window {
             };
             reads = reads.union(facts_of(&state.annotations.requires, view));
             reads = reads.union(facts_of(decides_from(context.program, instance), view));
-            // Its effects look up facts when it ends.
-            reads = reads.union(FactExpr::footprint(&own.effect_lookups, view));
+            reads = reads.union(FactExpr::footprint(&own.looked_up_at_end, view));
             let ended = instance.ended().and_then(|ended| own.outcome(&ended.outcome));
             let outcomes: Vec<usize> = match (instance.marker(), ended) {
                 (Some(marker), _) if marker.role == Role::Exit => vec![marker.leaves_by],

@@ -89,6 +89,8 @@ struct Touched<'a> {
     /// The path of the first computing state without `reads`.
     reads_everything: Option<String>,
     writes: Footprint,
+    /// The facts of functional predicates that must not hold together with those that it sets.
+    rivals: Vec<FactPattern>,
     shared: Vec<FactExpr>,
     assigns: BTreeSet<String>,
     uses: BTreeSet<String>,
@@ -101,6 +103,7 @@ fn touched<'a>(program: &'a Program, region: &'a State) -> Touched<'a> {
         reads: Footprint::NOTHING,
         reads_everything: None,
         writes: Footprint::NOTHING,
+        rivals: Vec::new(),
         shared: Vec::new(),
         assigns: BTreeSet::new(),
         uses: BTreeSet::new(),
@@ -140,6 +143,8 @@ fn touched<'a>(program: &'a Program, region: &'a State) -> Touched<'a> {
         // The effects that a wait foresees are made by somebody else.
         for effects in annotations.effects.values().filter(|_| !state.is_pause()) {
             touched.writes = all(touched.writes, EffectExpr::footprint(effects, &NothingKnown));
+            let rivals = program.ontology.iter().flat_map(|o| effects.iter().flat_map(|effect| o.rivals_of(effect)));
+            touched.rivals.extend(rivals.map(|rivals| rivals.pattern(&NothingKnown)));
         }
     }
     touched.assigns.retain(|name| !declared.contains(name));
@@ -199,9 +204,18 @@ fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings)
                 };
                 Some(format!("the fact `{}`", pair?))
             };
+            // A change of another fact decides whether a fact of a functional predicate may be set.
+            let rival = |a: &Touched, b: &Touched| -> Option<String> {
+                let Footprint::Patterns(written) = &a.writes else { return None };
+                let meets = |rivals: &&FactPattern| !covered(rivals) && written.iter().any(|w| w.overlaps(rivals));
+                let rivals = b.rivals.iter().find(meets)?;
+                Some(format!("facts of `{rivals}`, of which only one may hold"))
+            };
             let fact = both(&first.writes, &second.writes)
                 .or_else(|| both(&first.writes, &second.reads))
-                .or_else(|| both(&second.writes, &first.reads));
+                .or_else(|| both(&second.writes, &first.reads))
+                .or_else(|| rival(first, second))
+                .or_else(|| rival(second, first));
             let touches = |a: &Touched, b: &Touched| {
                 let mut assigned = a.assigns.iter();
                 assigned.find(|name| b.assigns.contains(*name) || b.uses.contains(*name)).cloned()
