@@ -51,50 +51,80 @@ pub fn holding(robot: &Robot, scene: &Scene, here: &Configuration) -> Mechanism 
 
 /// The arm and what is around it, in the frame of the base; everything but arm and base is as in `here`, the base where the scene has it.
 pub fn in_scene(robot: &Robot, scene: &Scene, here: &Configuration) -> (Mechanism, Vec<Obstacle>) {
-    let mut arm = holding(robot, scene, &Configuration { base: [0.0; 3], ..*here });
-    let resting = arm.poses(&JointVector::zeros(arm.joints.len()));
-    let (moving, standing): (Vec<usize>, Vec<usize>) =
-        (0..arm.links.len()).partition(|link| *link >= robot.model.links.len() || robot.arm_links.contains(link));
-    let (mut obstacles, carriers) = (Vec::new(), arm.carriers());
-    for index in standing {
-        let is_beside = |link: &usize| !arm.is_checked_among(&carriers, *link, index) || is_unseen(&arm, *link, index);
-        let beside: Vec<usize> = moving.iter().copied().filter(is_beside).collect();
-        let link = &mut arm.links[index];
-        link.spheres.clear();
-        link.meshes.clear();
-        link.covers = 0;
-        for (i, body) in std::mem::take(&mut link.bodies).into_iter().enumerate() {
-            let name = format!("link {} {i}", arm.links[index].name);
-            arm.allowed.extend(beside.iter().map(|link| (*link, name.clone())));
-            obstacles.push(Obstacle { name, pose: resting[index].compose(&body.upright()), geometry: body.geometry });
-        }
-    }
-    for link in moving {
-        cover(&mut arm.links[link]);
-    }
+    let BySpheres { arm, mut standing, .. } = BySpheres::of(robot, from_base(robot, scene, here));
+    standing.extend(objects(robot, scene));
+    (arm, standing)
+}
+
+/// As [`holding`], in the frame of the base.
+pub(crate) fn from_base(robot: &Robot, scene: &Scene, here: &Configuration) -> Mechanism {
+    holding(robot, scene, &Configuration { base: [0.0; 3], ..*here })
+}
+
+/// What stands in the scene, in the frame of the base.
+pub(crate) fn objects(robot: &Robot, scene: &Scene) -> Vec<Obstacle> {
     let inverse = on_floor(robot, &scene.base).inverse();
-    for object in &scene.objects {
+    let standing = scene.objects.iter().filter_map(|object| match &object.placement {
         // `holding` has what is in the gripper, `hands` says where the rest is.
-        if let Placement::World(pose) = &object.placement {
+        Placement::World(pose) => {
             let geometry = Geometry::from(&object.shape);
-            obstacles.push(Obstacle { name: object.name.clone(), pose: inverse.compose(pose), geometry });
+            Some(Obstacle { name: object.name.clone(), pose: inverse.compose(pose), geometry })
         }
+        _ => None,
+    });
+    standing.collect()
+}
+
+/// An arm as the vector checks know it.
+pub(crate) struct BySpheres {
+    /// What moves has spheres.
+    pub(crate) arm: Mechanism,
+    /// The primitives of links that do not move.
+    pub(crate) standing: Vec<Obstacle>,
+    /// Of which link each is.
+    pub(crate) links: Vec<usize>,
+}
+
+impl BySpheres {
+    /// An arm whose links have their exact shapes. Pairs of which spheres of meshes say nothing are not looked at.
+    pub(crate) fn of(robot: &Robot, mut arm: Mechanism) -> BySpheres {
+        let resting = arm.poses(&JointVector::zeros(arm.joints.len()));
+        let (moving, standing): (Vec<usize>, Vec<usize>) =
+            (0..arm.links.len()).partition(|link| *link >= robot.model.links.len() || robot.arm_links.contains(link));
+        let (mut obstacles, mut links, carriers) = (Vec::new(), Vec::new(), arm.carriers());
+        for index in standing {
+            let is_beside =
+                |link: &usize| !arm.is_checked_among(&carriers, *link, index) || arm.is_by_meshes(*link, index);
+            let beside: Vec<usize> = moving.iter().copied().filter(is_beside).collect();
+            let link = &mut arm.links[index];
+            link.spheres.clear();
+            link.meshes.clear();
+            link.covers = 0;
+            for (i, body) in std::mem::take(&mut link.bodies).into_iter().enumerate() {
+                let name = format!("link {} {i}", arm.links[index].name);
+                arm.allowed.extend(beside.iter().map(|link| (*link, name.clone())));
+                obstacles.push(Obstacle {
+                    name,
+                    pose: resting[index].compose(&body.upright()),
+                    geometry: body.geometry,
+                });
+                links.push(index);
+            }
+        }
+        for link in moving {
+            cover(&mut arm.links[link]);
+        }
+        BySpheres { arm, standing: obstacles, links }
     }
-    (arm, obstacles)
 }
 
 /// Of the pairs of links of which one at least moves with the arm, those that the vector checks do not look at though they are to be kept apart:
 /// spheres say nothing of them. The primitives of what stands are looked at as they are.
 pub(crate) fn unseen(robot: &Robot, arm: &Mechanism) -> BTreeSet<Pair> {
     let moves = |link: &usize| robot.arm_links.contains(link);
-    let is_unseen = |(a, b): &&Pair| moves(a) && moves(b) || is_unseen(arm, *a, *b);
+    let is_unseen = |(a, b): &&Pair| moves(a) && moves(b) || arm.is_by_meshes(*a, *b);
     let by_shapes = arm.by_shapes.iter().filter(|(a, b)| arm.is_checked(*a, *b));
     by_shapes.filter(is_unseen).copied().collect()
-}
-
-/// Whether what spheres stand for would always meet.
-fn is_unseen(arm: &Mechanism, a: usize, b: usize) -> bool {
-    arm.is_by_shapes(a, b) && [a, b].iter().any(|link| arm.links[*link].covers > 0)
 }
 
 /// The tool of the arm in the frame of the base. Joints that turn without end turn by a whole turn from zero, to either side.

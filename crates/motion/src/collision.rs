@@ -4,11 +4,13 @@
 //! arm moves (links, hand, fingers, the held object) an array of moving shapes. Bounding spheres decide most pairs, distances
 //! decide the rest. Which links are to be kept apart the mechanism says ([`arm::holding`](crate::arm::holding)). It says what touches what and how deep, and where contact is allowed; free motions are searched with the
 //! vector checks of `arm` and `space`. Shapes that move are grown by a padding. Between two postures no further apart than [`Checker::steps`]
-//! allows, no point is further than the padding from its place in the nearer one: where both are free, the way between is. Links that are told
-//! apart by their meshes have no padding: of those the finished motion is checked, from posture to posture (`validate`).
+//! allows, no point is further than the padding from its place in the nearer one: where both are free, the way between is. Meshes are looked at as they
+//! are. Links whose spheres say nothing of each other ([`Checks::by_shapes`](crate::pairs::Checks::by_shapes)) may be built to run closer to each other than
+//! the padding, and have none: of those the finished motion is checked, from posture to posture (`validate`).
 
 use crate::cloud::Cloud;
-use crate::frame::compose;
+use crate::confirmed::Couples;
+use crate::frame::{compose, norm};
 use crate::joint_vector::JointVector;
 use crate::keep::Region;
 use crate::levers::Levers;
@@ -16,7 +18,7 @@ use crate::mechanism::Mechanism;
 use crate::pairs::Pair;
 use crate::request::kept_out;
 use crate::robot::{Configuration, Geometry, Robot, to_f32};
-use crate::solid::{Form, Placed, Solid};
+use crate::solid::{Placed, Solid};
 use parry3d::math::{Pose as Pose32, Vector};
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene, Shape};
@@ -35,8 +37,8 @@ pub const PADDING_M: f64 = crate::arm::OVERHANG_M;
 /// measured, the arm is compliant.
 pub const CONTACT_TOLERANCE_M: f64 = 0.012;
 
-/// Shapes for which spheres stand that meet are no farther apart, in metres, than is worth telling.
-const FAR_M: f64 = 1.0;
+/// How much larger the sphere around a mesh is taken, for rounding, as a part of it.
+const ROUNDED: f64 = 1e-5;
 
 /// How far a point may move between two checked postures when there is no padding, in metres.
 const UNPADDED_STEP_M: f64 = 0.005;
@@ -52,6 +54,8 @@ pub struct Checker<'a> {
     moving: Vec<Moving>,
     /// Pairs of moving shapes that can meet.
     pairs: Vec<(usize, usize)>,
+    /// Links with meshes that have no padding beside each other.
+    close: BTreeSet<Pair>,
     /// Balls that stand around, in the world frame.
     cloud: Option<Arc<Cloud>>,
     /// How far a point moves at the most per radian of each arm joint (per metre of one that slides), in metres.
@@ -65,7 +69,6 @@ pub struct Checker<'a> {
 struct Obstacle {
     name: String,
     link: Option<usize>,
-    form: Form,
     solid: Solid,
     pose: Pose32,
     centre: Vector,
@@ -86,12 +89,12 @@ enum Entry {
 
 /// A shape of a link or of what stands.
 struct Part {
-    form: Form,
     /// There.
     at: Pose,
     solid: Solid,
     padded: Solid,
-    /// How far it reaches from its centre, and how much farther the padded one does.
+    /// The middle of a sphere around it, in its own frame, how far it reaches from there, and how much farther the padded one does.
+    middle: Vector,
     reach: [f64; 2],
 }
 
@@ -106,10 +109,11 @@ struct Moving {
     is_with_tool: bool,
     role: Role,
     local: Pose,
-    form: Form,
     /// Grown by the padding.
     padded: Solid,
     solid: Solid,
+    /// Of a sphere around it, in its own frame.
+    middle: Vector,
     radius: f32,
     /// Obstacles that it can meet.
     obstacles: Vec<usize>,
@@ -140,12 +144,10 @@ pub struct Collision {
     pub moving: String,
     /// What it meets: an object, or a link.
     pub other: String,
-    /// How deep, in metres; negative: how far apart, where that is less than the padding, or [`by_spheres`](Collision::by_spheres).
+    /// How deep, in metres; negative: how far apart, where that is less than the padding.
     pub depth_m: f64,
     /// How far apart they have to be, in metres.
     pub padding_m: f64,
-    /// The shapes are farther apart than the padding, but the spheres that stand for meshes are not.
-    pub by_spheres: bool,
 }
 
 impl fmt::Display for Collision {
@@ -154,12 +156,6 @@ impl fmt::Display for Collision {
         let millimetres = self.depth_m.abs() * 1000.0;
         if self.depth_m > 0.0 {
             return write!(f, "{moving} is {millimetres:.0} mm inside {other}");
-        }
-        if self.by_spheres {
-            return write!(
-                f,
-                "{moving} is only {millimetres:.0} mm away from {other}, and touches it by the spheres that stand for meshes"
-            );
         }
         // To a tenth: what is nearly far enough is not to read as if it were.
         let [apart, kept] = [millimetres, self.padding_m * 1000.0].map(|mm| (10.0 * mm).round() / 10.0);
@@ -180,6 +176,7 @@ impl<'a> Checker<'a> {
             obstacles: Vec::new(),
             moving: Vec::new(),
             pairs: Vec::new(),
+            close: BTreeSet::new(),
             cloud: None,
             reach: JointVector::zeros(robot.arm_joints().len()),
             poses,
@@ -210,30 +207,37 @@ impl<'a> Checker<'a> {
             self.add_obstacle(kept_out(i), None, *pose, part, Entry::Never);
         }
         let all = 0..self.obstacles.len();
-        let apart = self.moving.iter_mut().filter(|moving| moving.form.counts(false));
-        apart.for_each(|moving| moving.obstacles.extend(all.clone().skip(all.len() - regions.len())));
+        let regions = all.clone().skip(all.len() - regions.len());
+        self.moving.iter_mut().for_each(|moving| moving.obstacles.extend(regions.clone()));
         self
     }
 
-    /// The same for these pairs of links alone, and for nothing else.
-    pub(crate) fn of_pairs(mut self, pairs: &BTreeSet<Pair>) -> Checker<'a> {
-        let has = |a: usize, b: usize| pairs.contains(&(a.min(b), a.max(b)));
+    /// The same for these couples alone, and for nothing else. Where one link is looked at beside the cloud, all that are looked at are.
+    pub(crate) fn of(mut self, couples: &Couples) -> Checker<'a> {
+        let has = |a: usize, b: usize| couples.pairs.contains(&(a.min(b), a.max(b)));
+        let beside = |link: usize, name: &str| couples.beside.contains(&(link, name.to_owned()));
         let (moving, obstacles) = (&mut self.moving, &self.obstacles);
         for one in moving.iter_mut() {
             let link = one.link;
-            one.obstacles.retain(|o| obstacles[*o].link.is_some_and(|other| has(link, other)));
+            one.obstacles.retain(|o| match obstacles[*o].link {
+                Some(other) => has(link, other),
+                None => beside(link, &obstacles[*o].name),
+            });
         }
         self.pairs.retain(|(i, j)| has(moving[*i].link, moving[*j].link));
-        self.forget_idle();
+        self.cloud = self.cloud.filter(|cloud| couples.beside.iter().any(|(_, name)| *name == cloud.name));
+        let name = self.cloud.as_ref().map(|cloud| cloud.name.clone());
+        self.forget_idle(|link| name.as_ref().is_some_and(|name| beside(link, name)));
         self.reach = JointVector::zeros(self.reach.len());
         self.find_reach();
         self
     }
 
-    /// What moves and meets nothing that it is kept apart from is not looked at any more.
-    fn forget_idle(&mut self) {
+    /// What moves and meets nothing that it is kept apart from is not looked at any more; of some links it may meet the cloud.
+    fn forget_idle(&mut self, is_beside_cloud: impl Fn(usize) -> bool) {
         let in_pairs: BTreeSet<usize> = self.pairs.iter().flat_map(|(i, j)| [*i, *j]).collect();
-        let is_kept = |i: &usize| in_pairs.contains(i) || !self.moving[*i].obstacles.is_empty();
+        let is_busy = |moving: &Moving| !moving.obstacles.is_empty() || is_beside_cloud(moving.link);
+        let is_kept = |i: &usize| in_pairs.contains(i) || is_busy(&self.moving[*i]);
         let kept: Vec<usize> = (0..self.moving.len()).filter(is_kept).collect();
         let now = |i: usize| kept.binary_search(&i).unwrap_or_default();
         self.pairs = self.pairs.iter().map(|(i, j)| (now(*i), now(*j))).collect();
@@ -258,20 +262,19 @@ impl<'a> Checker<'a> {
                 () if hand.is_some() && link.parent == hand => Some((format!("link {}", link.name), i, Role::Finger)),
                 () => Some((format!("link {}", link.name), i, Role::Arm)),
             };
-            let primitives = link.forms().map(|(form, body)| Part {
-                form,
+            let primitives = link.own_bodies().iter().map(|body| Part {
                 at: body.pose,
                 solid: Solid::primitive(body, 0.0),
                 padded: Solid::primitive(body, self.padding),
+                middle: Vector::ZERO,
                 // A padded box's corners move out by more than the padding.
                 reach: [body.geometry.radius(), self.padding * 3_f64.sqrt()],
             });
-            let meshes = link.mesh_forms().map(|(form, meshed)| Part {
-                form,
-                at: meshed.pose,
-                solid: Solid::mesh(&meshed.mesh, 0.0),
-                padded: Solid::mesh(&meshed.mesh, self.padding),
-                reach: [meshed.mesh.radius(), self.padding],
+            let meshes = link.meshes.iter().map(|meshed| {
+                let (solid, padded) = (Solid::mesh(&meshed.mesh, 0.0), Solid::mesh(&meshed.mesh, self.padding));
+                let around = solid.shape.compute_local_bounding_sphere();
+                let reach = [f64::from(around.radius) * (1.0 + ROUNDED), self.padding];
+                Part { at: meshed.pose, solid, padded, middle: around.center, reach }
             });
             for part in primitives.chain(meshes).collect::<Vec<Part>>() {
                 match &moving {
@@ -297,11 +300,11 @@ impl<'a> Checker<'a> {
     }
 
     fn add_moving(&mut self, name: String, [link, frame]: [usize; 2], role: Role, part: Part) {
-        let Part { form, at, solid, padded, reach } = part;
+        let Part { at, solid, padded, middle, reach } = part;
         let radius = reach.iter().sum::<f64>() as f32;
         let (is_with_tool, obstacles) = (false, Vec::new());
         let moving =
-            Moving { name, link, frame, is_with_tool, role, local: at, form, padded, solid, radius, obstacles };
+            Moving { name, link, frame, is_with_tool, role, local: at, padded, solid, middle, radius, obstacles };
         self.moving.push(moving);
         self.placed.push(Pose32::IDENTITY);
         self.centres.push(Vector::ZERO);
@@ -309,28 +312,26 @@ impl<'a> Checker<'a> {
 
     fn add_obstacle(&mut self, name: String, link: Option<usize>, pose: Pose, part: Part, entry: Entry) {
         let pose = to_f32(&pose);
-        let Part { form, solid, reach: [radius, _], .. } = part;
-        let (centre, radius) = (pose.translation, radius as f32);
-        self.obstacles.push(Obstacle { name, link, form, solid, pose, centre, radius, entry });
+        let Part { solid, middle, reach: [radius, _], .. } = part;
+        let (centre, radius) = (pose.transform_point(middle), radius as f32);
+        self.obstacles.push(Obstacle { name, link, solid, pose, centre, radius, entry });
     }
 
     /// Which pairs are to be kept apart: the arm says so of its links, and everything of the arm is to be kept from the objects.
     fn find_pairs(&mut self, arm: &Mechanism) {
         let carriers = arm.carriers();
-        let is_looked_at = |a: &Moving, form: Form, link: Option<usize>| {
-            let by_shapes = link.is_some_and(|link| arm.is_by_shapes(a.link, link));
-            let is_checked = link.is_none_or(|link| arm.is_checked_among(&carriers, a.link, link));
-            is_checked && a.form.counts(by_shapes) && form.counts(by_shapes)
-        };
+        let is_looked_at =
+            |a: &Moving, link: Option<usize>| link.is_none_or(|link| arm.is_checked_among(&carriers, a.link, link));
         for i in 0..self.moving.len() {
             let a = &self.moving[i];
-            let beside = |o: &usize| is_looked_at(a, self.obstacles[*o].form, self.obstacles[*o].link);
+            let beside = |o: &usize| is_looked_at(a, self.obstacles[*o].link);
             let obstacles = (0..self.obstacles.len()).filter(beside).collect();
-            let among = |j: &usize| is_looked_at(a, self.moving[*j].form, Some(self.moving[*j].link));
+            let among = |j: &usize| is_looked_at(a, Some(self.moving[*j].link));
             self.pairs.extend((i + 1..self.moving.len()).filter(among).map(|j| (i, j)));
             self.moving[i].is_with_tool = arm.carrier(self.moving[i].link) == arm.carrier(self.robot.tool);
             self.moving[i].obstacles = obstacles;
         }
+        self.close = arm.by_shapes.iter().copied().filter(|(a, b)| arm.is_by_meshes(*a, *b)).collect();
     }
 
     /// The farthest that any of the shapes moves.
@@ -338,7 +339,8 @@ impl<'a> Checker<'a> {
         let joints = self.reach.len();
         for moving in &self.moving {
             let chain = self.robot.arm_chain(&self.configuration, moving.frame);
-            let end_m = chain.tip.compose(&moving.local).distance(&Pose::IDENTITY) + f64::from(moving.radius);
+            let middle = moving.middle.to_array().map(f64::from);
+            let end_m = norm(chain.tip.compose(&moving.local).transform(middle)) + f64::from(moving.radius);
             let shape = Levers::new(&chain.joints, end_m, self.robot.arm_joints()).per_joint(joints);
             self.reach = JointVector::from_fn(joints, |j| self.reach[j].max(shape[j]));
         }
@@ -380,15 +382,14 @@ impl<'a> Checker<'a> {
     /// What a posture touches first, if anything.
     pub fn collision(&mut self, arm: &JointVector, contact: Contact) -> Option<Collision> {
         let (i, other) = self.hit(arm, contact)?;
-        let depth_m = self.depth_of_shapes(i, other).or_else(|| self.depth(i, other)).unwrap_or(-self.padding);
-        let by_spheres = depth_m < -self.padding;
+        let depth_m = self.depth(i, other).unwrap_or(-self.padding);
         let other = match other {
             Other::Obstacle(o) => self.obstacles[o].name.clone(),
             Other::Moving(j) => self.moving[j].name.clone(),
             Other::Cloud => self.cloud.as_ref().map(|cloud| cloud.name.clone()).unwrap_or_default(),
         };
         let (moving, padding_m) = (self.moving[i].name.clone(), self.padding);
-        Some(Collision { moving, other, depth_m, padding_m, by_spheres })
+        Some(Collision { moving, other, depth_m, padding_m })
     }
 
     /// Whether something meets what stands that moves with the tool alone: then every posture of that pose of the tool does.
@@ -477,7 +478,7 @@ impl<'a> Checker<'a> {
         self.robot.update_arm(&self.configuration, &mut self.poses);
         for (i, moving) in self.moving.iter().enumerate() {
             let pose = to_f32(&compose(&self.poses[moving.frame], &moving.local));
-            self.centres[i] = pose.translation;
+            self.centres[i] = pose.transform_point(moving.middle);
             self.placed[i] = pose;
         }
     }
@@ -491,7 +492,7 @@ impl<'a> Checker<'a> {
                 let obstacle = &self.obstacles[o];
                 let reach = moving.radius + obstacle.radius;
                 if self.centres[i].distance_squared(obstacle.centre) < reach * reach
-                    && self.grown(i, obstacle.form).touches(&Placed { pose: obstacle.pose, solid: &obstacle.solid })
+                    && self.grown(i, obstacle.link).touches(&Placed { pose: obstacle.pose, solid: &obstacle.solid })
                     && !self.allowed(i, Other::Obstacle(o), contact)
                 {
                     return Some((i, Other::Obstacle(o)));
@@ -509,7 +510,7 @@ impl<'a> Checker<'a> {
             let reach = self.moving[i].radius + self.moving[j].radius;
             if self.centres[i].distance_squared(self.centres[j]) < reach * reach
                 && self
-                    .grown(i, self.moving[j].form)
+                    .grown(i, Some(self.moving[j].link))
                     .touches(&Placed { pose: self.placed[j], solid: &self.moving[j].solid })
             {
                 return Some((i, Other::Moving(j)));
@@ -553,13 +554,10 @@ impl<'a> Checker<'a> {
     /// less; negative: how deep one is in the other.
     fn gap_to_cloud(&self, i: usize, up_to: f64) -> f64 {
         let Some(cloud) = &self.cloud else { return up_to };
-        if !self.moving[i].form.counts(false) {
-            return up_to;
-        }
-        let (pose, shape) = (&self.placed[i], &self.moving[i].solid.shape);
+        let (pose, Solid { shape, inside, .. }) = (&self.placed[i], &self.moving[i].solid);
         let radius = cloud.radius_m() as f32;
         let mut gap = up_to;
-        cloud.visit_near(pose, shape, None, radius + up_to as f32, &mut |_, distance| {
+        cloud.visit_near(pose, shape, inside.as_deref(), radius + up_to as f32, &mut |_, distance| {
             gap = gap.min(f64::from(distance - radius));
             true
         });
@@ -576,38 +574,12 @@ impl<'a> Checker<'a> {
         (apart <= near).then_some(-apart)
     }
 
-    /// The same by the meshes themselves where spheres stand for them, however far apart; `None` where they do for neither.
-    fn depth_of_shapes(&self, i: usize, other: Other) -> Option<f64> {
-        let (form, link) = match other {
-            Other::Obstacle(o) => (self.obstacles[o].form, self.obstacles[o].link),
-            Other::Moving(j) => (self.moving[j].form, Some(self.moving[j].link)),
-            Other::Cloud => return None,
-        };
-        if ![self.moving[i].form, form].contains(&Form::Cover) {
-            return None;
-        }
-        let is_of = |k: &usize, link: usize| self.moving[*k].link == link && self.moving[*k].form.counts(true);
-        let stands = |o: &Obstacle| o.link == link && o.form.counts(true);
-        let others: Vec<Other> = match (other, link) {
-            (Other::Moving(_), Some(link)) => {
-                (0..self.moving.len()).filter(|k| is_of(k, link)).map(Other::Moving).collect()
-            }
-            (Other::Obstacle(_), Some(_)) => {
-                (0..self.obstacles.len()).filter(|o| stands(&self.obstacles[*o])).map(Other::Obstacle).collect()
-            }
-            _ => vec![other],
-        };
-        let own = (0..self.moving.len()).filter(|k| is_of(k, self.moving[i].link));
-        let apart = own.flat_map(|k| others.iter().map(move |other| self.apart_m(k, *other, FAR_M)));
-        apart.reduce(f64::min).map(|apart_m| -apart_m)
-    }
-
-    /// A moving shape as it is checked beside one of that form: with the padding, except where two links are told apart by their meshes. Such links may be
-    /// built to run closer to each other than the padding.
-    fn grown(&self, i: usize, beside: Form) -> Placed<'_> {
+    /// A moving shape as it is checked beside something, which may be of a link: with the padding, except beside links that may be built to run closer
+    /// to its own than that.
+    fn grown(&self, i: usize, link: Option<usize>) -> Placed<'_> {
         let moving = &self.moving[i];
-        let by_meshes = [moving.form, beside].contains(&Form::Covered);
-        Placed { pose: self.placed[i], solid: if by_meshes { &moving.solid } else { &moving.padded } }
+        let is_close = link.is_some_and(|link| self.close.contains(&(link.min(moving.link), link.max(moving.link))));
+        Placed { pose: self.placed[i], solid: if is_close { &moving.solid } else { &moving.padded } }
     }
 
     /// How far the unpadded shapes are from each other, in metres, or more than `enough_m`; below zero as far as they are deep in each other.
@@ -627,7 +599,7 @@ impl Part {
     fn standing(geometry: &Geometry) -> Part {
         let body = geometry.at(Pose::IDENTITY);
         let solid = || Solid::primitive(&body, 0.0);
-        Part { form: Form::Own, at: body.pose, solid: solid(), padded: solid(), reach: [geometry.radius(), 0.0] }
+        Part { at: body.pose, solid: solid(), padded: solid(), middle: Vector::ZERO, reach: [geometry.radius(), 0.0] }
     }
 }
 

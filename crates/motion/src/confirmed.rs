@@ -1,31 +1,30 @@
-//! What the search tells apart by exact shapes: pairs of which spheres say something wrong in a problem.
+//! What the search tells apart by exact shapes: couples of which spheres say something wrong in a problem.
 //!
 //! The search sees spheres that hold the shapes. Where they touch in the start or the goal and the shapes do not, there would be no search at all. So
-//! these pairs, of two links or of a link and what stands around, are left out of the vector checks and looked at here, from posture to posture, after
-//! everything else was found free. That is slow, and needed for few pairs of few problems. The finished path is checked by all exact shapes anyway.
+//! these couples, of two links or of a link and what stands around, are left out of the vector checks and looked at here, from posture to posture, after
+//! everything else was found free. That is slow, and needed for few couples of few problems. The finished path is checked by the exact shapes anyway.
 
 use crate::cloud::Cloud;
 use crate::exact::{self, Exact, Other, Shape};
 use crate::mechanism::Mechanism;
 use crate::pairs::Pair;
-use crate::solid::Form;
 use crate::space::{State, between};
 use crate::surroundings::Surroundings;
 use parry3d::math::Vector;
 use ratn_model::pose::Pose;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// What is not looked at by spheres.
+/// Couples of things that are to be kept apart.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Doubts {
+pub(crate) struct Couples {
     /// Links, the lower index first.
     pub(crate) pairs: BTreeSet<Pair>,
     /// Links, and the name of what stands around.
     pub(crate) beside: BTreeSet<(usize, String)>,
 }
 
-/// Couples of things that are to be kept apart, by their exact shapes.
+/// Couples that are kept apart by their exact shapes.
 #[derive(Debug, Clone)]
 pub(crate) struct Confirmed {
     mechanism: Mechanism,
@@ -34,15 +33,14 @@ pub(crate) struct Confirmed {
 
 #[derive(Debug, Clone)]
 struct Couple {
-    link: usize,
+    is: Met,
     own: Vec<Bounded>,
     other: Against,
 }
 
 #[derive(Debug, Clone)]
 enum Against {
-    Link(usize, Vec<Bounded>),
-    Standing(Vec<Bounded>),
+    Shapes(Vec<Bounded>),
     Cloud(Arc<Cloud>),
 }
 
@@ -61,24 +59,15 @@ pub(crate) enum Met {
     Beside((usize, String)),
 }
 
-impl Doubts {
-    /// What `coarse`, which knows a robot by its spheres, finds touching in a posture and `exact` finds apart.
-    pub(crate) fn add(&mut self, coarse: &Exact<'_>, exact: &Exact<'_>, positions: &[f64]) {
-        let mut mistaken = Doubts::met(coarse, positions);
-        let met = Doubts::met(exact, positions);
-        mistaken.pairs.retain(|pair| !met.pairs.contains(pair));
-        mistaken.beside.retain(|beside| !met.beside.contains(beside));
-        self.extend(mistaken);
-    }
-
+impl Couples {
     /// All that meets in a posture.
-    pub(crate) fn met(exact: &Exact<'_>, positions: &[f64]) -> Doubts {
-        let mut met = Doubts::default();
+    pub(crate) fn met(exact: &Exact<'_>, positions: &[f64]) -> Couples {
+        let mut met = Couples::default();
         exact.visit(positions, &mut |link, other, _| {
-            match other {
-                Other::Link(second) => drop(met.pairs.insert((link, second))),
-                Other::Standing(name) => drop(met.beside.insert((link, name.to_owned()))),
-            }
+            met.insert(match other {
+                Other::Link(second) => Met::Pair((link, second)),
+                Other::Standing(name) => Met::Beside((link, name.to_owned())),
+            });
             true
         });
         met
@@ -91,13 +80,20 @@ impl Doubts {
         }
     }
 
+    fn contains(&self, what: &Met) -> bool {
+        match what {
+            Met::Pair(pair) => self.pairs.contains(pair),
+            Met::Beside(beside) => self.beside.contains(beside),
+        }
+    }
+
     /// Shows each of them.
     pub(crate) fn into_each(self, see: &mut dyn FnMut(Met)) {
         self.pairs.into_iter().map(Met::Pair).chain(self.beside.into_iter().map(Met::Beside)).for_each(see);
     }
 
     /// Takes others, too, and says whether there were any that are new.
-    pub(crate) fn extend(&mut self, others: Doubts) -> bool {
+    pub(crate) fn extend(&mut self, others: Couples) -> bool {
         let before = (self.pairs.len(), self.beside.len());
         self.pairs.extend(others.pairs);
         self.beside.extend(others.beside);
@@ -118,27 +114,38 @@ impl Doubts {
 }
 
 impl Confirmed {
-    /// These couples of a robot and what stands around it.
-    pub(crate) fn new(mechanism: &Mechanism, surroundings: Surroundings<'_>, doubts: &Doubts) -> Confirmed {
-        let of_link = |link: usize| exact::shapes(&mechanism.links[link]).into_iter();
-        // Meshes as they are, not the spheres that stand for them.
-        let bounded = |link: usize| of_link(link).filter(|s| s.form.counts(true)).map(Bounded::new).collect();
-        let among =
-            doubts.pairs.iter().map(|&(a, b)| Couple { link: a, own: bounded(a), other: Against::Link(b, bounded(b)) });
-        let mut couples: Vec<Couple> = among.collect();
-        for (link, name) in &doubts.beside {
-            let own = || of_link(*link).filter(|s: &Shape| s.form != Form::Cover).map(Bounded::new).collect();
-            let standing = exact::standing(surroundings.obstacles, surroundings.meshes);
-            let standing: Vec<Bounded> =
-                standing.filter(|(own, _)| own == name).map(|(_, shape)| Bounded::new(shape)).collect();
-            if !standing.is_empty() {
-                couples.push(Couple { link: *link, own: own(), other: Against::Standing(standing) });
-            }
-            for cloud in surroundings.clouds.iter().filter(|cloud| cloud.name == *name) {
-                couples.push(Couple { link: *link, own: own(), other: Against::Cloud(Arc::new(cloud.clone())) });
-            }
+    /// These couples of a robot and what stands around it, which keeps `room_m` metres more from the robot.
+    pub(crate) fn new(
+        mechanism: &Mechanism,
+        surroundings: Surroundings<'_>,
+        couples: &Couples,
+        room_m: f64,
+    ) -> Confirmed {
+        let links = &mechanism.links;
+        let bounded = |link: usize, room_m: f64| -> Vec<Bounded> {
+            exact::shapes(&links[link], links[link].padding_m + room_m).into_iter().map(Bounded::new).collect()
+        };
+        let mut standing: BTreeMap<&str, Vec<Bounded>> = BTreeMap::new();
+        for (name, shape) in exact::standing(surroundings.obstacles, surroundings.meshes) {
+            standing.entry(name).or_default().push(Bounded::new(shape));
         }
-        Confirmed { mechanism: mechanism.clone(), couples }
+        let of_pair = |&(a, b): &Pair| Couple {
+            is: Met::Pair((a, b)),
+            own: bounded(a, 0.0),
+            other: Against::Shapes(bounded(b, 0.0)),
+        };
+        let mut confirmed: Vec<Couple> = couples.pairs.iter().map(of_pair).collect();
+        let named = |name: &String| couples.beside.iter().any(|(_, other)| other == name);
+        let clouds = surroundings.clouds.iter().filter(|cloud| named(&cloud.name));
+        let clouds: Vec<Arc<Cloud>> = clouds.map(|cloud| Arc::new(cloud.clone())).collect();
+        for (link, name) in &couples.beside {
+            let solid = standing.get(&**name).cloned().map(Against::Shapes);
+            let points = clouds.iter().filter(|cloud| cloud.name == *name).cloned().map(Against::Cloud);
+            let is = Met::Beside((*link, name.clone()));
+            let others = solid.into_iter().chain(points);
+            confirmed.extend(others.map(|other| Couple { is: is.clone(), own: bounded(*link, room_m), other }));
+        }
+        Confirmed { mechanism: mechanism.clone(), couples: confirmed }
     }
 
     /// Whether they are apart in a posture.
@@ -147,6 +154,19 @@ impl Confirmed {
             state[..self.mechanism.joints.len()].iter().map(|position| f64::from(*position)).collect();
         let poses = self.mechanism.poses(&positions);
         !self.couples.iter().any(|couple| couple.meets(&poses))
+    }
+
+    /// Of some of them those that are apart in a posture.
+    pub(crate) fn apart(&self, among: &Couples, positions: &[f64]) -> Couples {
+        let poses = self.mechanism.poses(positions);
+        let (mut apart, mut met) = (Couples::default(), Couples::default());
+        for couple in self.couples.iter().filter(|couple| among.contains(&couple.is)) {
+            if couple.meets(&poses) { &mut met } else { &mut apart }.insert(couple.is.clone());
+        }
+        // What stands around under one name may be several things.
+        apart.pairs.retain(|pair| !met.pairs.contains(pair));
+        apart.beside.retain(|beside| !met.beside.contains(beside));
+        apart
     }
 
     /// Whether they are apart on a straight motion cut into so many steps; `from` itself is not looked at.
@@ -170,12 +190,14 @@ impl Confirmed {
 
 impl Couple {
     fn meets(&self, poses: &[Pose]) -> bool {
-        let pose = &poses[self.link];
-        match &self.other {
-            Against::Link(other, shapes) => self.own.iter().any(|own| own.meets(pose, shapes, &poses[*other])),
-            Against::Standing(shapes) => self.own.iter().any(|own| own.meets(pose, shapes, &Pose::IDENTITY)),
-            Against::Cloud(cloud) => self.own.iter().any(|own| own.shape.placed(pose).depth_in(cloud).is_some()),
-        }
+        let (pose, at) = match &self.is {
+            Met::Pair((link, second)) => (&poses[*link], &poses[*second]),
+            Met::Beside((link, _)) => (&poses[*link], &Pose::IDENTITY),
+        };
+        self.own.iter().any(|own| match &self.other {
+            Against::Shapes(shapes) => own.meets(pose, shapes, at),
+            Against::Cloud(cloud) => own.shape.placed(pose).depth_in(cloud).is_some(),
+        })
     }
 }
 

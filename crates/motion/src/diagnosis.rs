@@ -2,7 +2,7 @@
 //!
 //! The exact shapes are asked first. The search sees spheres that hold them, so it may find touching what is not: then those spheres are asked.
 
-use crate::confirmed::{Doubts, Met};
+use crate::confirmed::{Confirmed, Couples, Met};
 use crate::exact::{Exact, Touch};
 use crate::geometry::{Body, Geometry};
 use crate::mechanism::Mechanism;
@@ -67,7 +67,7 @@ pub(crate) struct Blocked {
     /// For people.
     pub(crate) lines: Vec<String>,
     /// Pairs whose spheres meet in many postures though the shapes do not.
-    pub(crate) doubts: Doubts,
+    pub(crate) doubts: Couples,
 }
 
 /// Looks at the straight way, and at postures drawn from all of the planned joints.
@@ -84,13 +84,13 @@ pub(crate) fn blocked(mechanism: &Mechanism, problem: &Problem, ends: [&[f64]; 2
     for _ in 0..DRAWN {
         let posture: Vec<f64> = mechanism.joints.iter().map(|joint| pairs::drawn(joint, &mut random)).collect();
         let poses = mechanism.poses(&posture);
-        Doubts::met(&exact, &posture).into_each(&mut |what| met.entry(what).or_default()[0] += 1);
+        Couples::met(&exact, &posture).into_each(&mut |what| met.entry(what).or_default()[0] += 1);
         let by_spheres = searched.iter().filter(|pair| pairs::spheres_meet(mechanism, &around, &poses, **pair));
         by_spheres.for_each(|pair| met.entry(Met::Pair(*pair)).or_default()[1] += 1);
     }
     let mut often: Vec<(&Met, &[usize; 2])> = met.iter().collect();
     often.sort_by_key(|(_, counts)| Reverse(counts.iter().max().copied()));
-    let mut doubts = Doubts::default();
+    let mut doubts = Couples::default();
     for (what, [shapes, spheres]) in &often {
         if spheres.saturating_sub(*shapes) * 10 > DRAWN {
             doubts.insert((*what).clone());
@@ -122,13 +122,14 @@ pub(crate) fn doubts<'p>(
     mechanism: &Mechanism,
     problem: &Problem,
     postures: impl IntoIterator<Item = &'p [f64]>,
-) -> Doubts {
+) -> Couples {
     let surroundings = problem.surroundings();
     let coarse = of_spheres(mechanism, ROUNDING_M + overhang_m(problem));
-    let (coarse, exact) = (Exact::new(&coarse, surroundings), Exact::new(mechanism, surroundings));
-    let mut doubts = Doubts::default();
+    let coarse = Exact::new(&coarse, surroundings);
+    let mut doubts = Couples::default();
     for posture in postures {
-        doubts.add(&coarse, &exact, posture);
+        let met = Couples::met(&coarse, posture);
+        doubts.extend(Confirmed::new(mechanism, surroundings, &met, 0.0).apart(&met, posture));
     }
     doubts
 }
@@ -177,7 +178,7 @@ pub(crate) fn sphere_touches(
 }
 
 /// A robot that has its spheres for shapes, each so much larger, in the checks of the search.
-fn of_spheres(mechanism: &Mechanism, larger_m: f64) -> Mechanism {
+pub(crate) fn of_spheres(mechanism: &Mechanism, larger_m: f64) -> Mechanism {
     let body = |Sphere { centre: [x, y, z], radius }: &Sphere| Body {
         pose: Pose::at(*x, *y, *z),
         geometry: Geometry::Sphere { radius: radius + larger_m },

@@ -4,12 +4,13 @@
 //! cylinders and capsules they are off by up to a centimetre, to both sides: its search stops where rounding keeps it from a nearer point. So
 //! the search of Gilbert, Johnson and Keerthi (1988) is done here in `f64`. It goes on until a direction proves that the shapes are no nearer.
 //! Where it has to give up, they count as near as nothing disproves. Balls and capsules are a point and a segment with a radius, which is exact.
-//! Of a mesh the surface counts alone; the tree of parry3d finds the triangles that matter.
+//! Of a mesh the surface counts alone; the trees of parry3d find the triangles that matter: of two meshes both at once.
 
 use crate::frame::{cross, difference, norm, rotate};
 use parry3d::bounding_volume::Aabb;
 use parry3d::math::{Pose as Pose32, Vector};
-use parry3d::query::{self, DefaultQueryDispatcher, QueryDispatcher};
+use parry3d::partitioning::BvhNode;
+use parry3d::query::{self, DefaultQueryDispatcher, PointQuery, QueryDispatcher};
 use parry3d::shape::{Shape, TriMesh};
 use ratn_model::pose::Pose;
 use std::cell::Cell;
@@ -112,7 +113,8 @@ fn gap_in_first(pose: &Pose32, a: &dyn Shape, b: &dyn Shape, enough_m: f64, sear
         return Some(between(&first, &Turned::new(second, pose), enough_m));
     }
     match (a.as_trimesh(), b.as_trimesh()) {
-        (Some(mesh), _) => Some(gap_to_mesh(pose, mesh, b, enough_m, searches)),
+        (Some(first), Some(second)) => Some(gap_of_meshes(pose, first, second, enough_m, searches)),
+        (Some(mesh), None) => Some(gap_to_mesh(pose, mesh, b, enough_m, searches)),
         (None, Some(mesh)) => Some(gap_to_mesh(&pose.inverse(), mesh, a, enough_m, searches)),
         (None, None) => query::distance(&Pose32::IDENTITY, a, pose, b).ok().map(|apart| f64::from(apart.distance)),
     }
@@ -134,6 +136,42 @@ fn gap_to_mesh(pose: &Pose32, mesh: &TriMesh, other: &dyn Shape, enough_m: f64, 
         },
     );
     f64::from(nearest.map_or(beyond, |(_, gap)| gap))
+}
+
+/// Between the surfaces of two meshes, the second seen from the first.
+fn gap_of_meshes(pose: &Pose32, first: &TriMesh, second: &TriMesh, enough_m: f64, searches: &Cell<u32>) -> f64 {
+    // The trees round to `f32`.
+    let beyond = (enough_m * (1.0 + ROUNDED) + ROUNDED_M) as f32;
+    let best = Cell::new(beyond.min(some_gap(pose, first, second)));
+    let axes = [Vector::X, Vector::Y, Vector::Z].map(|axis| pose.rotation * axis);
+    let are_near = |a: &BvhNode, b: &BvhNode| {
+        let (mine, its) = (a.aabb(), b.aabb());
+        let half = its.half_extents();
+        let around = axes[0].abs() * half.x + axes[1].abs() * half.y + axes[2].abs() * half.z;
+        let middle = pose.transform_point(its.center()) - mine.center();
+        let between = (middle.abs() - around - mine.half_extents()).max(Vector::ZERO);
+        between.length() <= best.get() + ROUNDED_M as f32
+    };
+    for (a, b) in first.bvh().leaf_pairs(second.bvh(), are_near) {
+        let enough_m = f64::from(best.get());
+        // What cannot be told counts as touching; then nothing else is looked at.
+        let gap = gap_in_first(pose, &first.triangle(a), &second.triangle(b), enough_m, searches).unwrap_or(0.0) as f32;
+        best.set(best.get().min(gap));
+        if best.get() <= 0.0 {
+            break;
+        }
+    }
+    f64::from(best.get())
+}
+
+/// How far a point of one mesh is from one of the other, both near the other mesh: the meshes are no farther from each other than that.
+fn some_gap(pose: &Pose32, first: &TriMesh, second: &TriMesh) -> f32 {
+    let middle = pose.transform_point(second.local_aabb().center());
+    let on_first = first.project_local_point(middle, false).point;
+    let on_second = second.project_local_point(pose.inverse_transform_point(on_first), false).point;
+    let on_second = pose.transform_point(on_second);
+    let on_first = first.project_local_point(on_second, false).point;
+    (on_first - on_second).length() * (1.0 + ROUNDED as f32) + ROUNDED_M as f32
 }
 
 /// What a rounded shape is about.

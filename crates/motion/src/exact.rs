@@ -5,12 +5,10 @@
 
 use crate::cloud::Cloud;
 use crate::frame::compose;
-use crate::geometry::Body;
 use crate::mechanism::Mechanism;
-use crate::mesh::Meshed;
 use crate::robot::to_f32;
 use crate::robot_model::Link;
-use crate::solid::{Form, Placed, Solid};
+use crate::solid::{Placed, Solid};
 use crate::space::Obstacle;
 use crate::surroundings::{MeshObstacle, Surroundings};
 use ratn_model::pose::Pose;
@@ -59,7 +57,6 @@ pub(crate) enum Other<'n> {
 #[derive(Debug, Clone)]
 pub(crate) struct Shape {
     pub(crate) at: Pose,
-    pub(crate) form: Form,
     pub(crate) solid: Solid,
 }
 
@@ -93,7 +90,7 @@ impl<'a> Exact<'a> {
     pub fn new(mechanism: &'a Mechanism, surroundings: impl Into<Surroundings<'a>>) -> Exact<'a> {
         let Surroundings { obstacles, clouds, meshes } = surroundings.into();
         let standing = standing(obstacles, meshes).collect();
-        let bodies = mechanism.links.iter().map(shapes).collect();
+        let bodies = mechanism.links.iter().map(|link| shapes(link, link.padding_m)).collect();
         Exact { mechanism, obstacles: standing, clouds, bodies, pairs: mechanism.pairs() }
     }
 
@@ -142,17 +139,13 @@ impl<'a> Exact<'a> {
     /// Keeps of these pairs of links those that meet in a posture.
     pub(crate) fn retain_meeting(&self, positions: &[f64], pairs: &mut Vec<(usize, usize)>) {
         let placed = self.placed(positions);
-        pairs.retain(|&(a, b)| {
-            let by_shapes = self.mechanism.is_by_shapes(a, b);
-            let of = |link: usize| placed[link].iter().filter(move |(form, _)| form.counts(by_shapes));
-            of(a).any(|(_, body)| of(b).any(|(_, other)| body.touches(other)))
-        });
+        pairs.retain(|&(a, b)| placed[a].iter().any(|body| placed[b].iter().any(|other| body.touches(other))));
     }
 
     /// The numbers of a cloud's points whose balls come within `margin_m` metres of the robot.
     pub(crate) fn points_near(&self, positions: &[f64], cloud: &Cloud, margin_m: f64) -> BTreeSet<usize> {
         let mut near = BTreeSet::new();
-        for (_, body) in self.placed(positions).iter().flatten().filter(|(form, _)| form.counts(false)) {
+        for body in self.placed(positions).iter().flatten() {
             body.meet(cloud, margin_m as f32, &mut |point, _| {
                 near.insert(point);
                 true
@@ -161,11 +154,11 @@ impl<'a> Exact<'a> {
         near
     }
 
-    fn placed(&self, positions: &[f64]) -> Vec<Vec<(Form, Placed<'_>)>> {
+    fn placed(&self, positions: &[f64]) -> Vec<Vec<Placed<'_>>> {
         let poses = self.mechanism.poses(positions);
         let mut placed = Vec::with_capacity(self.bodies.len());
         for (shapes, link) in self.bodies.iter().zip(&poses) {
-            placed.push(shapes.iter().map(|shape| (shape.form, shape.placed(link))).collect());
+            placed.push(shapes.iter().map(|shape| shape.placed(link)).collect());
         }
         placed
     }
@@ -173,11 +166,8 @@ impl<'a> Exact<'a> {
     /// Shows what touches what and how deep, in metres, until it hears that no more is wanted.
     pub(crate) fn visit(&self, positions: &[f64], wants_more: &mut dyn FnMut(usize, Other<'_>, f64) -> bool) {
         let placed = self.placed(positions);
-        let of_link = |link: usize, by_shapes: bool| {
-            placed[link].iter().filter(move |(form, _)| form.counts(by_shapes)).map(|(_, body)| body)
-        };
-        for link in 0..placed.len() {
-            for body in of_link(link, false) {
+        for (link, shapes) in placed.iter().enumerate() {
+            for body in shapes {
                 for (obstacle, shape) in self.obstacles.iter().filter(|o| self.mechanism.is_kept_from(link, o.0)) {
                     if let Some(depth_m) = body.depth(&shape.placed(&Pose::IDENTITY))
                         && !wants_more(link, Other::Standing(obstacle), depth_m)
@@ -187,9 +177,9 @@ impl<'a> Exact<'a> {
                 }
             }
         }
-        for link in 0..placed.len() {
+        for (link, shapes) in placed.iter().enumerate() {
             for cloud in self.clouds.iter().filter(|cloud| self.mechanism.is_kept_from(link, &cloud.name)) {
-                let deepest = of_link(link, false).filter_map(|body| body.depth_in(cloud)).reduce(f64::max);
+                let deepest = shapes.iter().filter_map(|body| body.depth_in(cloud)).reduce(f64::max);
                 if let Some(depth_m) = deepest
                     && !wants_more(link, Other::Standing(&cloud.name), depth_m)
                 {
@@ -198,9 +188,8 @@ impl<'a> Exact<'a> {
             }
         }
         for &(link, second) in &self.pairs {
-            let by_shapes = self.mechanism.by_shapes.contains(&(link, second));
-            for body in of_link(link, by_shapes) {
-                for other in of_link(second, by_shapes) {
+            for body in &placed[link] {
+                for other in &placed[second] {
                     if let Some(depth_m) = body.depth(other)
                         && !wants_more(link, Other::Link(second), depth_m)
                     {
@@ -238,20 +227,19 @@ pub(crate) fn standing<'a>(
 ) -> impl Iterator<Item = (&'a str, Shape)> {
     let solid = |obstacle: &'a Obstacle| {
         let body = obstacle.geometry.at(obstacle.pose);
-        (&*obstacle.name, Shape { at: body.pose, form: Form::Own, solid: Solid::primitive(&body, 0.0) })
+        (&*obstacle.name, Shape { at: body.pose, solid: Solid::primitive(&body, 0.0) })
     };
     let mesh = |MeshObstacle { name, pose, mesh, .. }: &'a MeshObstacle| {
-        (&**name, Shape { at: *pose, form: Form::Own, solid: Solid::mesh(mesh, 0.0) })
+        (&**name, Shape { at: *pose, solid: Solid::mesh(mesh, 0.0) })
     };
     obstacles.iter().map(solid).chain(meshes.iter().map(mesh))
 }
 
-/// All shapes of a link.
-pub(crate) fn shapes(link: &Link) -> Vec<Shape> {
-    let padding_m = link.padding_m;
-    let primitive =
-        |(form, body): (Form, &Body)| Shape { at: body.pose, form, solid: Solid::primitive(body, padding_m) };
-    let mesh =
-        |(form, meshed): (Form, &Meshed)| Shape { at: meshed.pose, form, solid: Solid::mesh(&meshed.mesh, padding_m) };
-    link.forms().map(primitive).chain(link.mesh_forms().map(mesh)).collect()
+/// All shapes of a link as they are, larger on every side.
+pub(crate) fn shapes(link: &Link, padding_m: f64) -> Vec<Shape> {
+    let primitives = link.own_bodies().iter();
+    let primitives = primitives.map(|body| Shape { at: body.pose, solid: Solid::primitive(body, padding_m) });
+    let meshes = link.meshes.iter();
+    let meshes = meshes.map(|meshed| Shape { at: meshed.pose, solid: Solid::mesh(&meshed.mesh, padding_m) });
+    primitives.chain(meshes).collect()
 }

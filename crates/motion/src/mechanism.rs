@@ -8,7 +8,6 @@ use crate::mesh::MeshError;
 use crate::pairs::Checks;
 use crate::robot_model::{self, Drive, Joint, Link, RobotModel};
 use crate::robot_state::RobotState;
-use crate::solid::Form;
 use crate::spheres;
 use crate::urdf::RobotError;
 use ratn_model::pose::Pose;
@@ -126,8 +125,7 @@ impl Mechanism {
         let link = &mut self.links[link];
         link.padding_m = padding_m;
         let grown = |body: &Body| Body { geometry: body.geometry.grown(padding_m), ..*body };
-        let own = link.forms().filter(|(form, _)| *form == Form::Own);
-        link.spheres = own.flat_map(|(_, body)| spheres::cover(&grown(body))).collect();
+        link.spheres = link.own_bodies().iter().flat_map(|body| spheres::cover(&grown(body))).collect();
         link.spheres.extend(link.meshes.iter().flat_map(|meshed| meshed.cover(padding_m)));
     }
 
@@ -183,6 +181,11 @@ impl Mechanism {
     /// Whether two links are told apart by their exact shapes alone.
     pub fn is_by_shapes(&self, a: usize, b: usize) -> bool {
         self.by_shapes.contains(&(a.min(b), a.max(b)))
+    }
+
+    /// Whether two links are told apart so of which one at least has meshes that spheres stand for: they may be built to run close to each other.
+    pub(crate) fn is_by_meshes(&self, a: usize, b: usize) -> bool {
+        self.is_by_shapes(a, b) && [a, b].iter().any(|link| self.links[*link].covers > 0)
     }
 
     /// The link nearest to a link towards the root, itself included, that a planned joint moves.

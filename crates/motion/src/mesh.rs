@@ -1,8 +1,9 @@
 //! Triangle meshes as collision shapes: read from STL, OBJ and Collada, and covered by spheres (`mesh_cover`). Files are found and read
 //! by `mesh_files` or by the user of the crate.
 
-use crate::frame::norm;
 use crate::inside::Inside;
+use crate::mesh_pieces;
+pub use crate::mesh_pieces::MeshPieces;
 use crate::spheres::Sphere;
 use crate::{collada, mesh_cover, obj, stl};
 use parry3d::math::Vector;
@@ -84,6 +85,8 @@ pub struct Mesh {
     solid: OnceLock<(SharedShape, Arc<Inside>)>,
     /// Spheres that cover it, computed when first needed.
     cover: OnceLock<Vec<Sphere>>,
+    /// Convex pieces that do, made when they are first asked for.
+    pieces: OnceLock<MeshPieces>,
 }
 
 impl PartialEq for Mesh {
@@ -128,7 +131,7 @@ impl Mesh {
 
     /// Makes a mesh of triangles of another mesh, moved or selected.
     pub(crate) fn placed(triangles: Vec<[[f64; 3]; 3]>) -> Mesh {
-        Mesh { triangles, solid: OnceLock::new(), cover: OnceLock::new() }
+        Mesh { triangles, solid: OnceLock::new(), cover: OnceLock::new(), pieces: OnceLock::new() }
     }
 
     /// Reads a file by its extension: `.stl`, `.obj` or `.dae`; `scale` converts its numbers along x, y, z to metres. Where a scale
@@ -215,9 +218,12 @@ impl Mesh {
         (0..3).map(along).fold(0.0, f64::max)
     }
 
-    /// The greatest distance of a corner from the origin.
-    pub(crate) fn radius(&self) -> f64 {
-        self.triangles.iter().flatten().map(|corner| norm(*corner)).fold(0.0, f64::max)
+    /// Convex pieces that hold it; the same ones whenever they are asked for.
+    pub fn pieces(&self) -> &MeshPieces {
+        self.pieces.get_or_init(|| {
+            let (shape, inside) = self.solid();
+            mesh_pieces::pieces(&self.triangles, &shape, &inside)
+        })
     }
 
     /// Spheres that cover it, `padding` metres larger.

@@ -19,6 +19,7 @@ mod departure;
 mod error;
 mod improvement;
 mod retreat;
+mod search;
 mod straight_ways;
 
 use crate::collision::{Contact, distance, length};
@@ -112,10 +113,16 @@ fn plan_with_ends(
     let before_rad = length(&depart) + way_out_rad;
     arm.pad_at_least_tightly();
     let mut candidates = Candidates::find(&mut arm, &start, &mut pace)?;
-    let first = first_way(&mut arm, &start, &door, &candidates, &mut pace)?;
-    let first_length_rad = before_rad + f64::from(path_length(&first.path)) + candidates[first.candidate].length_rad;
-    let before = Before { depart: &depart, length_rad: before_rad, first_length_rad };
-    Improvement::new(&mut arm, &mut candidates, before).run(first, &mut pace)
+    loop {
+        let first = first_way(&mut arm, &start, &door, &candidates, &mut pace)?;
+        let candidate = &candidates[first.candidate];
+        let first_length_rad = before_rad + f64::from(path_length(&first.path)) + candidate.length_rad;
+        let (goal, before) = (candidate.goal(), Before { depart: &depart, length_rad: before_rad, first_length_rad });
+        match Improvement::new(&mut arm, &mut candidates, before).run(first, &mut pace) {
+            Err(PlanError::Unseen { .. }) if arm.doubt_between(&start, &goal) => {}
+            planned => return planned,
+        }
+    }
 }
 
 /// From the door at the start to that of a candidate.
@@ -129,7 +136,11 @@ fn first_way(
     let doors = candidates.doors();
     let budget = Budget { iterations: MAX_SEARCH_ITERATIONS, seed: arm.request().seed };
     pace.iteration()?;
-    match arm.connect(door, &doors, budget, pace) {
+    let mut route = arm.connect(door, &doors, budget, pace);
+    if matches!(route, Err(ConnectError::Exhausted { .. })) && arm.doubt_between(start, &arm.joints(&doors[0])) {
+        route = arm.connect(door, &doors, budget, pace);
+    }
+    match route {
         Ok(route) => {
             pace.iterations += route.iterations;
             Ok(Way { path: route.path, candidate: route.goal })
@@ -163,6 +174,11 @@ pub(crate) fn has_room(robot: &Robot, scene: &Scene, start: &Configuration) -> R
 
 fn door(arm: &mut ArmInScene<'_>, posture: &JointVector) -> Result<State, PlanError> {
     if let Some(door) = arm.door(posture) {
+        return Ok(door);
+    }
+    if arm.tells_apart_at(posture)
+        && let Some(door) = arm.door(posture)
+    {
         return Ok(door);
     }
     let reason = match arm.collision(posture, Contact::None) {

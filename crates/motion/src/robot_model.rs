@@ -14,7 +14,6 @@ use crate::mechanism::{MAX_JOINTS, Mechanism, MechanismError};
 use crate::mesh::{MeshError, Meshed};
 use crate::pairs::{self, Checks, Pair};
 use crate::robot_state::RobotState;
-use crate::solid::Form;
 use crate::spheres::Sphere;
 use crate::urdf::{self, Description, Loader, RobotError};
 use crate::urdf_tree::JointText;
@@ -159,16 +158,9 @@ impl Link {
         }
     }
 
-    /// Its primitives, the spheres that stand for its meshes among them.
-    pub fn forms(&self) -> impl Iterator<Item = (Form, &Body)> {
-        let own = self.bodies.len() - self.covers;
-        self.bodies.iter().enumerate().map(move |(i, body)| (if i < own { Form::Own } else { Form::Cover }, body))
-    }
-
-    /// Its meshes.
-    pub fn mesh_forms(&self) -> impl Iterator<Item = (Form, &Meshed)> {
-        let form = if self.covers > 0 { Form::Covered } else { Form::Own };
-        self.meshes.iter().map(move |meshed| (form, meshed))
+    /// Its primitives without the spheres that stand for its meshes. With the meshes they are its exact shape.
+    pub fn own_bodies(&self) -> &[Body] {
+        &self.bodies[..self.bodies.len() - self.covers]
     }
 
     /// Has spheres stand for its meshes from now on.

@@ -1,8 +1,4 @@
 //! A shape as the exact checks see it: what has an inside is solid, and all that is within its skin counts as the shape.
-//!
-//! Of a link whose meshes are stood for by spheres there are both. Two links whose spheres say nothing of each other
-//! ([`Checks::by_shapes`](crate::pairs::Checks::by_shapes)) are looked at by the meshes, everything else by the spheres ([`Form::counts`]): they
-//! hold the meshes, so nothing that touches is missed.
 
 use crate::distance;
 use crate::geometry::Body;
@@ -11,28 +7,6 @@ use crate::mesh::Mesh;
 use parry3d::math::{Pose as Pose32, Vector};
 use parry3d::shape::SharedShape;
 use std::sync::Arc;
-
-/// What a shape is of a link.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Form {
-    /// The shape itself.
-    Own,
-    /// A sphere, among those that stand for a mesh.
-    Cover,
-    /// A mesh that spheres stand for.
-    Covered,
-}
-
-impl Form {
-    /// Whether it is looked at with another shape; `by_shapes` says whether their links are told apart by their exact shapes.
-    pub fn counts(self, by_shapes: bool) -> bool {
-        match self {
-            Form::Own => true,
-            Form::Cover => !by_shapes,
-            Form::Covered => by_shapes,
-        }
-    }
-}
 
 /// See the module.
 #[derive(Debug, Clone)]

@@ -1,6 +1,6 @@
 //! One planning problem solved as a user of the crate would, timed by the caller's clock and checked by the exact shapes.
 
-use crate::confirmed::{Confirmed, Doubts};
+use crate::confirmed::{Confirmed, Couples};
 use crate::connect::{Budget, ConnectError, Route, connect};
 use crate::diagnosis;
 use crate::endless::{Unwound, unwound, wound_too_far};
@@ -101,7 +101,7 @@ pub fn run_with_isa(
         () => None,
     };
     let mut space = Space::with_isa(mechanism, problem.surroundings(), isa);
-    let mut doubts = Doubts::default();
+    let mut doubts = Couples::default();
     let mut postures = goals.iter().chain([&ends[0].0]).map(Vec::as_slice);
     if refusal.is_none() && postures.clone().any(|posture| !space.is_free(&state(posture))) {
         doubts = diagnosis::doubts(mechanism, problem, &mut postures);
@@ -119,7 +119,7 @@ pub fn run_with_isa(
     // Spheres may leave no way where the shapes do, and the shapes reject what was found beside pairs that the search does not look at.
     let again = match &tried.outcome {
         Ok(Found { touch: Some(_), .. }) => {
-            doubts.extend(Doubts { pairs: mechanism.by_shapes.clone(), ..Doubts::default() })
+            doubts.extend(Couples { pairs: mechanism.by_shapes.clone(), ..Couples::default() })
         }
         Err(ConnectError::Exhausted { .. } | ConnectError::TimeUp { .. }) => {
             let blocked = diagnosis::blocked(mechanism, problem, [&ends[0].0, &goals[0]]);
@@ -167,10 +167,10 @@ struct Tried {
 
 impl Task<'_> {
     /// The robot among the obstacles, of which this is looked at by exact shapes.
-    fn confirming(&self, doubts: &Doubts) -> Space {
+    fn confirming(&self, doubts: &Couples) -> Space {
         let (mechanism, surroundings) = (&self.unwound.mechanism, self.problem.surroundings());
         let mut space = Space::with_isa(&doubts.left_out_of(mechanism), surroundings, self.isa);
-        space.confirm(Confirmed::new(mechanism, surroundings, doubts));
+        space.confirm(Confirmed::new(mechanism, surroundings, doubts, 0.0));
         space
     }
 

@@ -111,3 +111,43 @@ fn five_arms_are_too_many() {
     let made = Robot::of(read, &urdf(&["a", "b", "c", "d", "e"]), None, &mut |_| unreachable!("it has no meshes"));
     assert_eq!(made.unwrap_err().to_string(), "5 arms: at most 4 are supported");
 }
+
+/// A prism along z over an outline in x and y that turns to the left, whose faces are cut into these triangles, as an STL.
+fn prism(outline: &[[f64; 2]], faces: &[[usize; 3]], [from, to]: [f64; 2]) -> Vec<u8> {
+    let at = |i: usize, z: f64| [outline[i][0], outline[i][1], z];
+    let face =
+        |[a, b, c]: &[usize; 3]| [[at(*a, from), at(*c, from), at(*b, from)], [at(*a, to), at(*b, to), at(*c, to)]];
+    let side = |i: usize| {
+        let next = (i + 1) % outline.len();
+        let [a, b, c, d] = [at(i, from), at(next, from), at(next, to), at(i, to)];
+        [[a, b, c], [a, c, d]]
+    };
+    let triangles = faces.iter().flat_map(face).chain((0..outline.len()).flat_map(side));
+    let facet = |triangle: [[f64; 3]; 3]| {
+        let corners: String = triangle.iter().map(|[x, y, z]| format!("vertex {x} {y} {z}\n")).collect();
+        format!("facet normal 0 0 0\nouter loop\n{corners}endloop\nendfacet\n")
+    };
+    format!("solid s\n{}endsolid s\n", triangles.map(facet).collect::<String>()).into_bytes()
+}
+
+#[test]
+fn the_pad_of_a_mesh_is_what_is_flat_of_it_where_it_is_nearest_to_the_other_finger() {
+    // Along the hand's x: a pad 3 cm wide from 0 to 12 mm, from which a wedge widens to 5 cm at 40 mm.
+    let outline = [[0.0, 0.03], [0.0, 0.0], [0.012, 0.0], [0.04, -0.01], [0.04, 0.04], [0.012, 0.03]];
+    let stl = prism(&outline, &[[0, 1, 2], [0, 2, 5], [2, 3, 4], [2, 4, 5]], [-0.03, 0.03]);
+    let pad =
+        "<collision><origin xyz='-0.004 0.005 0.1'/><geometry><box size='0.012 0.03 0.06'/></geometry></collision>";
+    let meshed =
+        "<collision><origin xyz='-0.01 -0.01 0.1'/><geometry><mesh filename='pad.stl'/></geometry></collision>";
+    let urdf = urdf(&["one"]);
+    assert!(urdf.contains(pad));
+    let text = "name = 'r'\nurdf = 'r'\n[arm]\njoints = ['one_turn']\ntool = 'one_tool'\n\
+                [gripper]\njoint = 'one_finger'\nhand = 'one_hand'\nfinger = 'one_a'\n";
+    let read = RobotDescription::read(text).unwrap();
+    let robot = Robot::of(read, &urdf.replace(pad, meshed), None, &mut |_| Ok(stl.clone())).unwrap();
+    let near = |a: [f64; 3], b: [f64; 3]| (0..3).all(|i| (a[i] - b[i]).abs() < 1e-9);
+    let [_, pad] = robot.finger_parts()[..] else { panic!("{:?}", robot.finger_parts()) };
+    // It is as wide as it is within the 2 mm that pads give way, and as thick as the whole.
+    assert!(pad.is_flat && near(pad.half, [0.015, 0.02, 0.03]), "{pad:?}");
+    assert!(near(pad.middle, [-0.005, 0.02, 0.0]), "{pad:?}");
+}

@@ -15,7 +15,6 @@ use rapier3d::parry::shape::SharedShape;
 use ratn_model::pose::Pose;
 use ratn_motion::distance::gap_within;
 use ratn_motion::robot::{ArmPosition, Configuration, Joint, Robot, to_f32};
-use ratn_motion::solid::Form;
 use std::collections::BTreeMap;
 
 /// The distance of two parts that are both on their ways, in metres.
@@ -92,7 +91,6 @@ pub(super) enum Crossing {
 /// One body of a link, wherever it is on the way.
 struct Swept {
     link: usize,
-    form: Form,
     in_link: Pose,
     shape: SharedShape,
     /// The farthest that a point of it is from its origin.
@@ -312,18 +310,17 @@ impl Swept {
     fn all(robot: &Robot, ahead: &Ahead) -> Vec<Swept> {
         let of_link = |link: &usize| {
             let (link, of) = (*link, &robot.model.links[*link]);
-            let primitives = of.forms().map(|(form, body)| (form, body.pose, body.geometry.shape(0.0)));
-            let meshes = of.mesh_forms().map(|(form, meshed)| (form, meshed.pose, meshed.mesh.surface()));
-            let shapes: Vec<_> = primitives.chain(meshes).collect();
-            shapes.into_iter().map(move |(form, pose, shape)| Swept::new(link, form, pose, shape))
+            let primitives = of.own_bodies().iter().map(|body| (body.pose, body.geometry.shape(0.0)));
+            let meshes = of.meshes.iter().map(|meshed| (meshed.pose, meshed.mesh.surface()));
+            primitives.chain(meshes).map(move |(pose, shape)| Swept::new(link, pose, shape)).collect::<Vec<_>>()
         };
         ahead.links.iter().flat_map(of_link).collect()
     }
 
-    fn new(link: usize, form: Form, in_link: Pose, shape: SharedShape) -> Swept {
+    fn new(link: usize, in_link: Pose, shape: SharedShape) -> Swept {
         let around = shape.compute_local_bounding_sphere();
         let radius = around.center.length() + around.radius;
-        Swept { link, form, in_link, shape, radius, places: Vec::new(), tree: Vec::new(), leg: 0.0, dropped: 0.0 }
+        Swept { link, in_link, shape, radius, places: Vec::new(), tree: Vec::new(), leg: 0.0, dropped: 0.0 }
     }
 
     /// The farthest that a point of the body is at one place from where it is at another.
@@ -389,10 +386,9 @@ impl Swept {
         }
     }
 
-    /// Whether two bodies are to be kept apart: not where their links are excepted, nor where other shapes of theirs are looked at.
+    /// Whether two bodies are to be kept apart: not where their links are excepted.
     fn is_kept_from(&self, other: &Swept, robot: &Robot) -> bool {
-        let by_shapes = robot.model.is_by_shapes(self.link, other.link);
-        !robot.model.is_excepted(self.link, other.link) && self.form.counts(by_shapes) && other.form.counts(by_shapes)
+        !robot.model.is_excepted(self.link, other.link)
     }
 
     /// How far it is from another body at the places of that one, or `up_to` where that is less.

@@ -156,8 +156,10 @@ fn ungrasping(view: &Robot, is_first: bool, boxes: Option<&Boxes>, of_arm: &str)
     let name = &view.model.links[finger].name;
     let Some(part) = Pads::part(view) else {
         return unmet(
-            format!("none of the shapes of its finger `{name}` is a box that lies along the axes of the tool's frame"),
-            "the pad that holds is found on such a box",
+            format!(
+                "none of the shapes of its finger `{name}` is a box that lies along the axes of the tool's frame, or a mesh"
+            ),
+            "the pad that holds is found on such a shape",
             "give the finger one, or turn the tool's frame so that y is the way the fingers close",
         );
     };

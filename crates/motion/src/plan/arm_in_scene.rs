@@ -5,27 +5,25 @@
 
 use super::contact;
 use super::error::PlanError;
+use super::search::Search;
 use crate::arm::{self, joints};
 use crate::cloud::Cloud;
-use crate::collision::{Checker, Collision, Contact, PADDING_M};
+use crate::collision::{CONTACT_TOLERANCE_M, Checker, Collision, Contact, PADDING_M};
 use crate::connect::{Budget, ConnectError, Route, connect};
 use crate::constrained::{self, Constraint};
-use crate::diagnosis::{crowding, sphere_touches};
 use crate::joint_vector::JointVector;
 use crate::keep::{KeptAxis, timed_keeping};
 use crate::ladder;
 use crate::leaving::{Leaving, NOTHING_NEW};
 use crate::line::{self, Cause, LineError, Lines};
-use crate::mechanism::Mechanism;
 use crate::pace::{Pace, Stop};
 use crate::reach::{Postures, Reach, Target};
 use crate::refine::{End, Measure, Refinement};
 use crate::request::{Request, kept_out};
 use crate::robot::{Configuration, Geometry, Robot};
 use crate::simplify::shortened;
-use crate::space::{Obstacle, Space, State, state};
+use crate::space::{Obstacle, State, state};
 use crate::straight::Straight;
-use crate::surroundings::Surroundings;
 use crate::timing::rough::Rough;
 use crate::timing::{Section, Speed, timed_while};
 use crate::trajectory::Curve;
@@ -78,11 +76,10 @@ pub(super) struct ArmInScene<'a> {
     scene: &'a Scene,
     request: &'a Request,
     here: Configuration,
-    mechanism: Mechanism,
     checker: Checker<'a>,
-    space: Space,
-    /// The pairs of links that the space does not look at, by their exact shapes.
-    unseen: Option<Checker<'a>>,
+    search: Search<'a>,
+    /// The pairs of links that spheres say nothing of, and what links with meshes are beside of which they do not, by the exact shapes.
+    unseen: [Option<Checker<'a>>; 2],
     /// What a camera saw that is nothing known, in the world frame.
     seen: Option<Arc<Cloud>>,
     /// The tool, in the frame of the base, which is at `base`.
@@ -97,36 +94,39 @@ pub(super) struct ArmInScene<'a> {
 impl<'a> ArmInScene<'a> {
     pub(super) fn new(robot: &'a Robot, scene: &'a Scene, request: &'a Request) -> Result<ArmInScene<'a>, PlanError> {
         let here = request.start.with_base(&scene.base);
-        let (mechanism, mut obstacles) = arm::in_scene(robot, scene, &here);
-        let held = arm::holding(robot, scene, &here);
-        let unseen = Some(arm::unseen(robot, &held)).filter(|pairs| !pairs.is_empty());
-        let unseen = unseen.map(|pairs| Checker::new(robot, scene, &here, 0.0).of_pairs(&pairs));
         let base = arm::on_floor(robot, &scene.base);
-        obstacles.extend(request.keep_out.iter().enumerate().map(|(i, region)| Obstacle {
+        let mut around = arm::objects(robot, scene);
+        around.extend(request.keep_out.iter().enumerate().map(|(i, region)| Obstacle {
             name: kept_out(i),
             pose: base.inverse().compose(&region.pose),
             geometry: Geometry::from(&Shape::Box { size: region.size }),
         }));
         let seen = request.seen.as_ref().map(|seen| seen.unknown(robot, scene, &here)).transpose()?;
         let clouds = seen.as_ref().map(|cloud| cloud.moved(&base.inverse())).transpose()?;
-        let surroundings = Surroundings { obstacles: &obstacles, clouds: clouds.as_slice(), meshes: &[] };
         let seen = seen.map(Arc::new);
-        Ok(ArmInScene {
+        let search = Search::new(robot, arm::from_base(robot, scene, &here), around, clouds.into_iter().collect());
+        let mut arm = ArmInScene {
             robot,
             scene,
             request,
             checker: checker(robot, scene, request, &here, seen.as_ref(), PADDING_M),
-            space: arm::space(&mechanism, surroundings),
-            unseen,
-            reach: Reach::new(&mechanism, robot.tool, Pose::IDENTITY),
+            unseen: [None, None],
+            reach: Reach::new(search.mechanism(), robot.tool, Pose::IDENTITY),
+            search,
             base,
             seen,
             constraint: None,
             rough: Rough::new(&request.joints(robot), request.speed),
             random: ChaCha8Rng::seed_from_u64(request.seed),
             here,
-            mechanism,
-        })
+        };
+        arm.look_at_unseen();
+        Ok(arm)
+    }
+
+    fn look_at_unseen(&mut self) {
+        let all = checker(self.robot, self.scene, self.request, &self.here, self.seen.as_ref(), 0.0);
+        self.unseen = self.search.unseen(&all);
     }
 
     pub(super) fn request(&self) -> &'a Request {
@@ -326,7 +326,7 @@ impl<'a> ArmInScene<'a> {
             let up = [0.0, 0.0, 1.0];
             keep.axis = Some(KeptAxis { axis: tool.inverse().rotate(up), direction: Some(up), tolerance_rad });
         }
-        self.constraint = keep.constraint(&self.mechanism, self.robot.tool, &self.base, &tool);
+        self.constraint = keep.constraint(self.search.mechanism(), self.robot.tool, &self.base, &tool);
         self.kept_along(departure).map_err(|reason| PlanError::NotKept { place: "on the departure", reason })?;
         self.kept_at(&state(&start)).map_err(|reason| PlanError::NotKept { place: "at the start", reason })
     }
@@ -349,10 +349,29 @@ impl<'a> ArmInScene<'a> {
         }
     }
 
+    /// Has the meshes looked at of which the spheres find no room in a posture where the meshes do; whether any are.
+    pub(super) fn tells_apart_at(&mut self, posture: &JointVector) -> bool {
+        if self.search.doubt_at(posture) {
+            self.look_at_unseen();
+        }
+        self.search.tells_apart()
+    }
+
+    /// The same of what is in the way between two postures, and elsewhere, where no way was found, or one on which something meets; whether there is more of
+    /// it than before.
+    pub(super) fn doubt_between(&mut self, from: &JointVector, to: &JointVector) -> bool {
+        let is_new = self.search.doubt_between(from, to);
+        if is_new {
+            self.look_at_unseen();
+        }
+        is_new
+    }
+
     /// The posture itself where the vector checks find room for it, else one close by that can be reached from it.
     pub(super) fn door(&mut self, posture: &JointVector) -> Option<State> {
         let here = state(posture);
-        if self.space.is_within(&here) && self.space.is_free(&here) {
+        let space = &mut self.search.space;
+        if space.is_within(&here) && space.is_free(&here) {
             return Some(here);
         }
         (1..=WAYS_OUT).find_map(|attempt| {
@@ -361,7 +380,7 @@ impl<'a> ArmInScene<'a> {
             let door = state(&self.robot.clamp(&aside));
             let keeps = self.constraint.as_ref().is_none_or(|c| c.holds_along(&here, &door));
             let free = keeps
-                && self.space.is_free(&door)
+                && self.search.space.is_free(&door)
                 && self.checker.edge_is_free(posture, &joints(self.robot, &door), Contact::None);
             free.then_some(door)
         })
@@ -369,14 +388,7 @@ impl<'a> ArmInScene<'a> {
 
     /// What is so near in a posture that touches nothing that the vector checks find no room.
     pub(super) fn crowding(&self, posture: &JointVector) -> Option<String> {
-        let (mechanism, obstacles) = arm::in_scene(self.robot, self.scene, &self.here);
-        let mut touch = sphere_touches(&mechanism, Surroundings::from(&obstacles), posture, 0.0).into_iter().next()?;
-        // What stands of the robot is an obstacle there, with a number behind its name.
-        let standing = touch.other.strip_prefix("link ").and_then(|name| name.rsplit_once(' '));
-        if let Some((link, _)) = standing.filter(|(link, _)| mechanism.link(link).is_some()) {
-            touch.other = link.to_owned();
-        }
-        Some(crowding(&mechanism, self.robot.model.links.len(), &touch))
+        self.search.crowding(posture)
     }
 
     /// About how long a motion along postures takes, in seconds.
@@ -394,8 +406,8 @@ impl<'a> ArmInScene<'a> {
     ) -> Result<Route, ConnectError> {
         let control = &mut |_: usize| pace.answer();
         match &self.constraint {
-            None => connect(&mut self.space, from, to, budget, control),
-            Some(constraint) => constrained::connect(&mut self.space, constraint, from, to, budget, control),
+            None => connect(&mut self.search.space, from, to, budget, control),
+            Some(constraint) => constrained::connect(&mut self.search.space, constraint, from, to, budget, control),
         }
     }
 
@@ -404,10 +416,10 @@ impl<'a> ArmInScene<'a> {
         let control = &mut |_: usize| pace.answer();
         if let Some(constraint) = &self.constraint {
             let (shortcuts, seed) = (constrained::SHORTCUTS, self.request.seed);
-            let stopped = constrained::shorten(&mut self.space, constraint, path, shortcuts, seed, control);
+            let stopped = constrained::shorten(&mut self.search.space, constraint, path, shortcuts, seed, control);
             return stopped.map_err(Stop::from);
         }
-        match shortened(&mut self.space, path, control) {
+        match shortened(&mut self.search.space, path, control) {
             Ok(short) => *path = short,
             Err(ConnectError::Cancelled) => return Err(Stop::Cancelled),
             Err(_) => {}
@@ -427,7 +439,7 @@ impl<'a> ArmInScene<'a> {
 
     /// One step of it.
     pub(super) fn step(&mut self, refinement: &mut Refinement, pace: &mut Pace<'_>) -> Result<(), Stop> {
-        Ok(refinement.step(&mut self.space, &mut |_| pace.answer())?)
+        Ok(refinement.step(&mut self.search.space, &mut |_| pace.answer())?)
     }
 
     /// The sections as one motion within the limits that were asked for, which keeps what is to be kept between all its knots as well, and on which
@@ -439,7 +451,7 @@ impl<'a> ArmInScene<'a> {
     ) -> Result<Curve, PlanError> {
         let request = self.request;
         let joints = request.joints(self.robot);
-        let (space, constraint) = (&mut self.space, &self.constraint);
+        let (space, constraint) = (&mut self.search.space, &self.constraint);
         let mut is_free = |from: &JointVector, to: &JointVector| {
             let (from, to) = (state(from), state(to));
             constraint.as_ref().is_none_or(|c| c.holds_along(&from, &to)) && space.is_free_motion(&from, &to)
@@ -454,15 +466,17 @@ impl<'a> ArmInScene<'a> {
                 }),
         };
         let curve = request.tool_speed.within(&self.reach, &request.speed.into(), &mut time)?;
-        match &mut self.unseen {
-            None => Ok(curve),
-            // No link of the robot may press another one.
-            Some(unseen) => match check_collisions_while(unseen, &curve, Contact::None, goes_on) {
-                Ok(true) => Ok(curve),
+        // No link of the robot may press another one; what the gripper may press the straight parts have been looked at for.
+        let contacts = [Contact::None, Contact::Gripper(CONTACT_TOLERANCE_M)];
+        for (unseen, contact) in self.unseen.iter_mut().zip(contacts) {
+            let looked_at = unseen.as_mut().map(|unseen| check_collisions_while(unseen, &curve, contact, goes_on));
+            match looked_at.unwrap_or(Ok(true)) {
+                Ok(true) => {}
                 // Time is no limit of the first motion: what ends its check is that the caller does not want it any more.
-                Ok(false) => Err(PlanError::Cancelled),
-                Err(violation) => Err(PlanError::Unseen { reason: violation.to_string() }),
-            },
+                Ok(false) => return Err(PlanError::Cancelled),
+                Err(violation) => return Err(PlanError::Unseen { reason: violation.to_string() }),
+            }
         }
+        Ok(curve)
     }
 }

@@ -47,6 +47,17 @@ impl Candidate {
     }
 }
 
+/// Why a posture at a goal is no candidate.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub(super) enum Refusal {
+    /// The vector checks find no room where this approach begins.
+    #[error("there is too little room before the goal")]
+    Crowded(Vec<JointVector>),
+    /// For people.
+    #[error("{0}")]
+    Other(String),
+}
+
 /// The candidates of one request; their numbers stay.
 pub(super) struct Candidates<'a> {
     /// How deep an approach may press into what it touches.
@@ -79,11 +90,23 @@ impl<'a> Candidates<'a> {
             for press_m in presses_m(arm.robot()) {
                 candidates.press_m = press_m;
                 refused.clear();
+                let mut crowded = Vec::new();
                 for posture in &postures {
                     pace.poll()?;
                     match candidates.candidate(arm, posture) {
                         Ok(candidate) => candidates.found.push(candidate),
-                        Err(reason) => refused.push(reason),
+                        Err(Refusal::Crowded(approach)) => crowded.push(approach),
+                        Err(Refusal::Other(reason)) => refused.push(reason),
+                    }
+                }
+                let is_in_vain = candidates.found.is_empty();
+                for approach in crowded {
+                    // Only where nothing else is left: what is told apart by meshes makes the search slower.
+                    let is_told_apart = is_in_vain && arm.tells_apart_at(&approach[0]);
+                    let mended = if is_told_apart { with_door(arm, approach) } else { Err(Refusal::Crowded(approach)) };
+                    match mended {
+                        Ok(candidate) => candidates.found.push(candidate),
+                        Err(refusal) => refused.push(refusal.to_string()),
                     }
                 }
                 if !candidates.found.is_empty() {
@@ -119,24 +142,25 @@ impl<'a> Candidates<'a> {
     }
 
     /// The goal posture with its approach, or why it is none.
-    pub(super) fn candidate(&mut self, arm: &mut ArmInScene<'a>, goal: &JointVector) -> Result<Candidate, String> {
+    pub(super) fn candidate(&mut self, arm: &mut ArmInScene<'a>, goal: &JointVector) -> Result<Candidate, Refusal> {
         let part = &arm.request().approach;
         let mut approach = vec![*goal];
         if part.is_some() {
             let back = arm.line_back(goal, part);
-            approach = back.map_err(|e| format!("approaching the goal {part}, backwards from there: {e}"))?;
+            approach =
+                back.map_err(|e| Refusal::Other(format!("approaching the goal {part}, backwards from there: {e}")))?;
             if let Some(collision) = arm.straight_collision(&approach, self.press_m) {
-                return Err(format!("approaching the goal, {collision}"));
+                return Err(Refusal::Other(format!("approaching the goal, {collision}")));
             }
             let leaving = self.leaving.as_mut();
             if let Some(collision) = leaving.and_then(|open| straight_collision(open, &approach, self.press_m)) {
-                return Err(format!("leaving the goal with open fingers, {collision}"));
+                return Err(Refusal::Other(format!("leaving the goal with open fingers, {collision}")));
             }
             approach.reverse();
         }
         match arm.collision(&approach[0], Contact::None) {
-            Some(collision) if part.is_some() => Err(format!("before the approach, {collision}")),
-            Some(collision) => Err(format!("at the goal, {collision}")),
+            Some(collision) if part.is_some() => Err(Refusal::Other(format!("before the approach, {collision}"))),
+            Some(collision) => Err(Refusal::Other(format!("at the goal, {collision}"))),
             None => with_door(arm, approach),
         }
     }
@@ -193,11 +217,11 @@ fn postures_at(
     Ok(found)
 }
 
-fn with_door(arm: &mut ArmInScene<'_>, approach: Vec<JointVector>) -> Result<Candidate, String> {
+fn with_door(arm: &mut ArmInScene<'_>, approach: Vec<JointVector>) -> Result<Candidate, Refusal> {
     let entry = approach[0];
-    let door = arm.door(&entry).ok_or_else(|| "there is too little room before the goal".to_owned())?;
-    arm.kept_at(&door).map_err(|reason| format!("at the goal {reason}"))?;
-    arm.kept_along(&approach).map_err(|reason| format!("approaching the goal {reason}"))?;
+    let Some(door) = arm.door(&entry) else { return Err(Refusal::Crowded(approach)) };
+    arm.kept_at(&door).map_err(|reason| Refusal::Other(format!("at the goal {reason}")))?;
+    arm.kept_along(&approach).map_err(|reason| Refusal::Other(format!("approaching the goal {reason}")))?;
     let way_in = (door != state(&entry)).then(|| arm.joints(&door));
     let length_rad = length(&approach) + way_in.map_or(0.0, |way_in| distance(&way_in, &entry));
     let way_in_s = way_in.map_or(0.0, |way_in| arm.lasts_s(&[state(&way_in), state(&entry)]));

@@ -75,9 +75,9 @@ pub enum PlanError {
         /// What is broken.
         reason: String,
     },
-    /// Two links meet on the way that was found. Spheres say nothing of them, so the search does not go around.
+    /// By the shapes something meets on the way that was found, where the search has looked at some postures of it alone.
     #[error(
-        "on the way that was found, {reason}; the search does not look at these two links: give finer shapes, or pass a posture aside"
+        "on the way that was found, {reason}, on a straight part or between the postures that the search has looked at: pass a posture aside"
     )]
     Unseen {
         /// When, and which.

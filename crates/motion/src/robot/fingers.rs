@@ -1,22 +1,27 @@
 //! The shapes of a finger as they stand in the tool's frame where the fingers meet: how thick a finger is, and where its pad is.
 //!
 //! Nothing is assumed of how hand, finger and tool are mounted on each other: the description says that fingers close along the tool's y
-//! axis, and where the shapes are follows from the URDF.
+//! axis, and where the shapes are follows from the URDF. The pad of a mesh is what of it is flat, or nearly, where it is nearest to the other finger.
 
 use super::{Geometry, Robot, to_f32};
+use crate::mesh::Mesh;
+use crate::surface::cut;
 use ratn_model::pose::Pose;
 
 /// How far the faces of a box may be turned out of the tool's axes, as a part of a unit vector: rounding.
 const ALIGNED: f64 = 1e-6;
 
-/// One shape of a finger, as a cuboid along the axes of the tool's frame that holds it, in metres.
+/// What of a mesh is no deeper than that behind the place that is nearest to the other finger is its pad: as far as pads give way, in metres.
+const PAD_DEEP_M: f64 = 0.002;
+
+/// One shape of a finger, as a cuboid along the axes of the tool's frame that holds it or, of a mesh, its pad; in metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FingerPart {
     /// The cuboid's middle, with the fingers where they meet.
     pub middle: [f64; 3],
     /// Half of its edges.
     pub half: [f64; 3],
-    /// It is a box whose faces lie along the tool's axes: the cuboid is the shape itself.
+    /// It is a box whose faces lie along the tool's axes, the cuboid is the shape itself; or the pad of a mesh, as thick as the mesh is there.
     pub is_flat: bool,
 }
 
@@ -28,8 +33,11 @@ impl Robot {
         positions[joint.indices[0]] = 0.0;
         let (in_root, tool) = self.in_shared_link(finger, &positions);
         let in_tool = tool.inverse().compose(&in_root);
-        let bodies = &self.model.links[finger].bodies;
-        bodies.iter().map(|body| part(&in_tool.compose(&body.pose), &body.geometry)).collect()
+        let link = &self.model.links[finger];
+        let primitives = link.own_bodies().iter().map(|body| part(&in_tool.compose(&body.pose), &body.geometry));
+        let outward = self.finger_ways().iter().find(|(link, _)| *link == finger).map_or(1.0, |(_, way)| way[1]);
+        let meshes = link.meshes.iter().map(|meshed| pad(&in_tool.compose(&meshed.pose), &meshed.mesh, outward));
+        primitives.chain(meshes).collect()
     }
 
     /// Each link that the gripper's joint moves, and how far it goes in the tool's frame from where the joint is at zero to where it is at its
@@ -61,6 +69,48 @@ impl Robot {
         };
         (seen(&of_link).unwrap_or(Pose::IDENTITY), seen(&of_tool).unwrap_or(Pose::IDENTITY))
     }
+}
+
+/// The pad of a mesh of a finger that opens along the tool's y, or against it where `outward` is below 0.
+fn pad(pose: &Pose, mesh: &Mesh, outward: f64) -> FingerPart {
+    let sign = if outward < 0.0 { -1.0 } else { 1.0 };
+    // As if it opened along y.
+    let seen = |corner: &[f64; 3]| {
+        let [x, y, z] = pose.transform(*corner);
+        [x, sign * y, z]
+    };
+    let triangles: Vec<[[f64; 3]; 3]> = mesh.triangles().iter().map(|triangle| triangle.each_ref().map(seen)).collect();
+    let corners: Vec<[f64; 3]> = triangles.iter().flatten().copied().collect();
+    let [least, greatest] = bounds(&corners);
+    let front: Vec<[f64; 3]> =
+        triangles.iter().flat_map(|triangle| cut(triangle, 1, least[1] + PAD_DEEP_M, -1.0)).collect();
+    let [mut inner, mut outer] = bounds(&front);
+    inner[1] = least[1];
+    // As thick as it is behind the middle of the pad.
+    let [x, z] = [0, 2].map(|i| (inner[i] + outer[i]) / 2.0);
+    let behind = triangles.iter().filter_map(|triangle| at_line(triangle, x, z)).fold(f64::NEG_INFINITY, f64::max);
+    outer[1] = if behind > inner[1] { behind } else { greatest[1] };
+    let mut middle: [f64; 3] = std::array::from_fn(|i| (inner[i] + outer[i]) / 2.0);
+    middle[1] *= sign;
+    FingerPart { middle, half: std::array::from_fn(|i| (outer[i] - inner[i]) / 2.0), is_flat: true }
+}
+
+fn bounds(corners: &[[f64; 3]]) -> [[f64; 3]; 2] {
+    let along = |i: usize| corners.iter().map(move |corner| corner[i]);
+    [
+        std::array::from_fn(|i| along(i).fold(f64::INFINITY, f64::min)),
+        std::array::from_fn(|i| along(i).fold(f64::NEG_INFINITY, f64::max)),
+    ]
+}
+
+/// Where a line along y meets a triangle.
+fn at_line(triangle: &[[f64; 3]; 3], x: f64, z: f64) -> Option<f64> {
+    let [a, b, c] = triangle;
+    let area = |p: &[f64; 3], q: &[f64; 3]| (p[0] - x) * (q[2] - z) - (q[0] - x) * (p[2] - z);
+    let shares = [area(b, c), area(c, a), area(a, b)];
+    let sum: f64 = shares.iter().sum();
+    let is_in = shares.iter().all(|share| *share >= 0.0) || shares.iter().all(|share| *share <= 0.0);
+    (is_in && sum != 0.0).then(|| (shares[0] * a[1] + shares[1] * b[1] + shares[2] * c[1]) / sum)
 }
 
 fn part(pose: &Pose, geometry: &Geometry) -> FingerPart {

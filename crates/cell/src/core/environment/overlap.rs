@@ -28,6 +28,13 @@ pub(super) struct Meeting {
     pub(super) at: Vector,
 }
 
+impl Meeting {
+    /// The same, with the other one first.
+    pub(super) fn turned(self) -> Meeting {
+        Meeting { normal: -self.normal, ..self }
+    }
+}
+
 /// How far a depth may be off, in metres, and the distance of two cores as a part of it: the directions to what is near are as precise.
 const PRECISE_M: f64 = 1e-5;
 const PRECISE: f64 = 1e-4;

@@ -1,7 +1,7 @@
-//! What a link is without the spheres that the engine has in place of its meshes: its primitives and the meshes themselves.
+//! A mesh of a link as the judge sees it: its triangles as they are, not the convex pieces that the engine has for them.
 //!
-//! Two such links touch where a triangle of one meets a triangle or a primitive of the other, or where one is wholly inside the other. How deep is the
-//! most that one triangle, or one corner, has to be moved: so it is never more than the links have to be. The work of a look has a bound.
+//! It touches something where a triangle meets that, or where one is wholly inside the other. How deep is the most that one triangle, or one corner, has to be
+//! moved: so it is never more than the links have to be. The work of a look has a bound.
 
 use super::convex::Convex;
 use super::overlap::{Meeting, meeting};
@@ -9,14 +9,13 @@ use super::vector::Vector;
 use rapier3d::math::Vector as Vector32;
 use rapier3d::parry::bounding_volume::{Aabb, BoundingVolume};
 use rapier3d::parry::partitioning::{Bvh, BvhBuildStrategy};
+use rapier3d::parry::query::PointQuery;
 use rapier3d::parry::shape::SharedShape;
 use ratn_model::pose::Pose;
 use ratn_motion::mesh::Meshed;
-use ratn_motion::robot::{Link, to_f32};
-use ratn_motion::solid::Form;
-use std::f64::consts::PI;
+use ratn_motion::robot::to_f32;
 
-/// Triangles of one link that are held against those of the other in one look, at the most. What is found by then counts.
+/// Triangles that are looked at in one look, at the most, those of two meshes in pairs. What is found by then counts.
 const MAX_PAIRS: usize = 4_000;
 
 /// Corners of a mesh of which it is asked how deep they are in another one, at the most.
@@ -25,80 +24,48 @@ const MAX_CORNERS: usize = 64;
 /// The boxes around triangles are in `f32`: by how much they are larger, in metres.
 const ROUNDED_M: f64 = 1e-5;
 
-/// See the module.
-#[derive(Debug, Clone)]
-pub(super) struct Shell {
-    primitives: Vec<(Pose, SharedShape)>,
-    surfaces: Vec<Surface>,
-}
-
 /// A mesh, in the frame of its link.
 #[derive(Debug, Clone)]
-struct Surface {
+pub(super) struct Surface {
     triangles: Vec<[Vector; 3]>,
     tree: Bvh,
-}
-
-/// A link that is being looked at.
-#[derive(Clone, Copy)]
-struct Placed<'s> {
-    shell: &'s Shell,
-    at: Pose,
-}
-
-impl Shell {
-    pub(super) fn of(link: &Link) -> Shell {
-        let own = link.forms().filter(|(form, _)| *form == Form::Own);
-        let primitives = own.map(|(_, body)| (body.pose, body.geometry.shape(0.0))).collect();
-        Shell { primitives, surfaces: link.meshes.iter().map(Surface::of).collect() }
-    }
-
-    /// How this link, in its place, meets another one in its own, if they are no farther apart than `within_m` metres.
-    pub(super) fn meeting(&self, at: Pose, other: &Shell, its: Pose, within_m: f64) -> Option<Meeting> {
-        let (a, b) = (Placed { shell: self, at }, Placed { shell: other, at: its });
-        let mut pairs = MAX_PAIRS;
-        let mut found = Vec::new();
-        for first in a.primitives() {
-            found.extend(b.primitives().filter_map(|second| meeting(&first, &second, within_m)));
-            let of_surface = |surface: &Surface| surface.meeting(b.at, &first, within_m, &mut pairs);
-            found.extend(other.surfaces.iter().filter_map(of_surface).map(turned));
-        }
-        for second in b.primitives() {
-            let of_surface = |surface: &Surface| surface.meeting(a.at, &second, within_m, &mut pairs);
-            found.extend(self.surfaces.iter().filter_map(of_surface));
-        }
-        for first in &self.surfaces {
-            for second in &other.surfaces {
-                found.extend(first.meeting_surface(a.at, second, b.at, within_m, &mut pairs));
-            }
-        }
-        found.into_iter().reduce(deeper)
-    }
-}
-
-impl Placed<'_> {
-    fn primitives(self) -> impl Iterator<Item = Convex> {
-        let placed = move |(pose, shape): &(Pose, SharedShape)| Convex::of(&**shape, &to_f32(&self.at.compose(pose)));
-        self.shell.primitives.iter().filter_map(placed)
-    }
+    /// The convex pieces that the engine has for it.
+    hulls: Vec<SharedShape>,
 }
 
 impl Surface {
-    fn of(meshed: &Meshed) -> Surface {
+    pub(super) fn of(meshed: &Meshed) -> Surface {
         let corner = |corner: &[f64; 3]| Vector(meshed.pose.transform(*corner));
+        let point = |at: &[f64; 3]| narrow(corner(at));
+        let hull = |hull: &Vec<[f64; 3]>| SharedShape::convex_hull(&hull.iter().map(point).collect::<Vec<_>>());
+        let hulls = meshed.mesh.pieces().hulls.iter().filter_map(hull).collect();
         let triangles: Vec<[Vector; 3]> =
             meshed.mesh.triangles().iter().map(|triangle| triangle.each_ref().map(corner)).collect();
         let boxes = triangles.iter().map(|triangle| around(triangle, 0.0)).enumerate();
-        Surface { tree: Bvh::from_iter(BvhBuildStrategy::Binned, boxes), triangles }
+        Surface { tree: Bvh::from_iter(BvhBuildStrategy::Binned, boxes), triangles, hulls }
+    }
+
+    /// The convex pieces that the engine has for it, in the frame of the link.
+    pub(super) fn hulls(&self) -> &[SharedShape] {
+        &self.hulls
+    }
+
+    /// The box around it in its place.
+    pub(super) fn extent(&self, at: &Pose) -> Aabb {
+        moved(&self.tree.root_aabb(), at)
     }
 
     fn triangle(&self, index: u32, at: &Pose) -> Convex {
         Convex::triangle(self.triangles[index as usize].map(|Vector(corner)| Vector(at.transform(corner))))
     }
 
-    /// How it meets something convex.
-    fn meeting(&self, at: Pose, other: &Convex, within_m: f64, pairs: &mut usize) -> Option<Meeting> {
-        let found = self.nearest_triangle(at, other, within_m, pairs);
+    /// How it meets something convex, if they are no farther apart than `within_m` metres, or, where that is below 0, at least so deep in each other.
+    pub(super) fn meeting(&self, at: Pose, other: &Convex, within_m: f64) -> Option<Meeting> {
+        self.meeting_near(at, other, within_m.max(0.0)).filter(|met| met.depth_m >= -within_m)
+    }
+
+    fn meeting_near(&self, at: Pose, other: &Convex, within_m: f64) -> Option<Meeting> {
+        let found = self.nearest_triangle(at, other, within_m, &mut { MAX_PAIRS });
         let Vector(middle) = other.middle;
         let seen = Vector(at.inverse().transform(middle));
         if found.is_some_and(|found| found.depth_m >= 0.0) || !self.tree.root_aabb().contains_local_point(narrow(seen))
@@ -106,41 +73,56 @@ impl Surface {
             return found;
         }
         // What has no triangle in it may be wholly inside; then it is as deep as its middle, and more.
-        let inside = self.holds(seen).then(|| self.depth_of(seen, &at)).map(turned);
+        let inside = self.holds(seen).then(|| self.depth_of(seen, &at)).map(Meeting::turned);
         inside.or(found)
     }
 
-    /// The same of what is near by: the deepest that a triangle is in it.
+    /// The same of what is near by: the deepest that a triangle is in it. Triangles are looked at as deep as they may be at the most, until no other one may be
+    /// deeper than one that was found.
     fn nearest_triangle(&self, at: Pose, other: &Convex, within_m: f64, pairs: &mut usize) -> Option<Meeting> {
-        let near = extent(other, &at, within_m);
-        let mut found = None;
+        let near = extent(other, &at, within_m.max(0.0));
+        let ways: Vec<Vector> =
+            other.across().into_iter().filter_map(Vector::direction).flat_map(|way| [way, -way]).collect();
+        let mut open: Vec<(f64, Convex)> = Vec::new();
         for index in self.tree.intersect_aabb(&near) {
             let Some(left) = pairs.checked_sub(1) else { break };
             *pairs = left;
-            let met = meeting(&self.triangle(index, &at), other, within_m);
-            found = found.into_iter().chain(met).reduce(deeper);
+            let triangle = self.triangle(index, &at);
+            let at_most = deepest_along(&ways, &triangle, other);
+            if at_most >= -within_m {
+                open.push((at_most, triangle));
+            }
+        }
+        open.sort_by(|(a, _), (b, _)| b.total_cmp(a));
+        let mut found: Option<Meeting> = None;
+        for (at_most, triangle) in open {
+            let least = found.map_or(-within_m, |found| found.depth_m);
+            if at_most < least {
+                break;
+            }
+            found = found.into_iter().chain(meeting(&triangle, other, -least)).reduce(deeper);
         }
         found
     }
 
-    /// How it meets another one.
-    fn meeting_surface(
-        &self,
-        at: Pose,
-        other: &Surface,
-        its: Pose,
-        within_m: f64,
-        pairs: &mut usize,
-    ) -> Option<Meeting> {
+    /// How it meets another one, as [`Surface::meeting`].
+    pub(super) fn meeting_surface(&self, at: Pose, other: &Surface, its: Pose, within_m: f64) -> Option<Meeting> {
+        self.meeting_near_surface(at, other, its, within_m.max(0.0)).filter(|met| met.depth_m >= -within_m)
+    }
+
+    fn meeting_near_surface(&self, at: Pose, other: &Surface, its: Pose, within_m: f64) -> Option<Meeting> {
+        let mut pairs = MAX_PAIRS;
         let [seen, from_there] = [at.inverse().compose(&its), its.inverse().compose(&at)];
         let (theirs, mine) = (moved(&other.tree.root_aabb(), &seen), moved(&self.tree.root_aabb(), &from_there));
         let near = theirs.loosened((within_m + ROUNDED_M) as f32);
         let mut found: Option<Meeting> = None;
         for index in self.tree.intersect_aabb(&near) {
-            if *pairs == 0 {
+            if pairs == 0 {
                 break;
             }
-            let met = other.nearest_triangle(its, &self.triangle(index, &at), within_m, pairs).map(turned);
+            let within_m = found.map_or(within_m, |found| -found.depth_m);
+            let met = other.nearest_triangle(its, &self.triangle(index, &at), within_m, &mut pairs);
+            let met = met.map(Meeting::turned);
             found = found.into_iter().chain(met).reduce(deeper);
         }
         let do_cross = found.is_some_and(|found| found.depth_m >= 0.0);
@@ -148,7 +130,7 @@ impl Surface {
         let corners = |inside: bool| if do_cross { MAX_CORNERS } else { usize::from(inside) };
         let first = self.deepest_in(&at, other, &its, corners(other.tree.root_aabb().contains(&mine)));
         let second = other.deepest_in(&its, self, &at, corners(self.tree.root_aabb().contains(&theirs)));
-        found.into_iter().chain(first).chain(second.map(turned)).reduce(deeper)
+        found.into_iter().chain(first).chain(second.map(Meeting::turned)).reduce(deeper)
     }
 
     /// How deep the deepest of some of its corners is in another one.
@@ -169,8 +151,13 @@ impl Surface {
 
     /// How a point of something else that is inside, in the frame of the link, meets the surface: the point comes first.
     fn depth_of(&self, point: Vector, at: &Pose) -> Meeting {
-        let nearest = self.triangles.iter().map(|triangle| nearest(triangle, point));
-        let nearest = nearest.min_by(|a, b| (*a - point).length().total_cmp(&(*b - point).length())).unwrap_or(point);
+        let aside = narrow(point);
+        let near = self.tree.find_best(
+            f32::MAX,
+            |node, _| node.aabb().distance_to_local_point(aside, true),
+            |index, _| Some((nearest(&self.triangles[index as usize], point) - point).length() as f32),
+        );
+        let nearest = near.map_or(point, |(index, _)| nearest(&self.triangles[index as usize], point));
         let inwards = (point - nearest).direction().unwrap_or(Vector::AXES[2]);
         Meeting {
             depth_m: (point - nearest).length(),
@@ -179,21 +166,39 @@ impl Surface {
         }
     }
 
-    /// Whether a point is inside, in the frame of the link: the surface takes the whole of what is seen from there (Van Oosterom and Strackee 1983).
+    /// Whether a point is inside, in the frame of the link: a straight line upwards from there leaves the surface more often than it enters it, or the other
+    /// way round.
     fn holds(&self, point: Vector) -> bool {
-        let seen = |triangle: &[Vector; 3]| {
-            let [a, b, c] = triangle.map(|corner| corner - point);
-            let (x, y, z) = (a.length(), b.length(), c.length());
-            let below = x * y * z + a.dot(b) * z + b.dot(c) * x + c.dot(a) * y;
-            2.0 * a.dot(b.cross(c)).atan2(below)
-        };
-        self.triangles.iter().map(seen).sum::<f64>().abs() > 2.0 * PI
+        let (from, room) = (narrow(point), self.tree.root_aabb());
+        let top = Vector32::new(from.x, from.y, room.maxs.z.max(from.z));
+        let line = Aabb::new(from, top).loosened(ROUNDED_M as f32);
+        self.tree.intersect_aabb(&line).map(|index| crossed(&self.triangles[index as usize], point)).sum::<i32>() != 0
     }
 }
 
-/// The same, with the other one first.
-fn turned(meeting: Meeting) -> Meeting {
-    Meeting { normal: -meeting.normal, ..meeting }
+/// Whether a straight line upwards from a point crosses a triangle: 1 from below, -1 from above. A line along a common edge crosses one of two triangles.
+fn crossed(triangle: &[Vector; 3], Vector([x, y, z]): Vector) -> i32 {
+    let edges = [[0, 1], [1, 2], [2, 0]].map(|edge| edge.map(|corner: usize| triangle[corner].0));
+    // An edge counts where one of its ends is beyond y and the other is not.
+    let beyond = |[a, b]: &[[f64; 3]; 2]| {
+        let (a, b) = if a[1] <= b[1] { (a, b) } else { (b, a) };
+        a[1] <= y && y < b[1] && x < a[0] + (b[0] - a[0]) * ((y - a[1]) / (b[1] - a[1]))
+    };
+    if edges.iter().filter(|edge| beyond(edge)).count() != 1 {
+        return 0;
+    }
+    let across = (triangle[1] - triangle[0]).cross(triangle[2] - triangle[0]).0;
+    let Vector([a, b, c]) = triangle[0];
+    // The height of the plane there.
+    let height = c - (across[0] * (x - a) + across[1] * (y - b)) / across[2];
+    if across[2] == 0.0 || height < z { 0 } else { across[2].signum() as i32 }
+}
+
+/// How deep two shapes are in each other at the most: no deeper than along any of these directions, nor from middle to middle.
+fn deepest_along(ways: &[Vector], a: &Convex, b: &Convex) -> f64 {
+    let between = (b.middle - a.middle).direction();
+    let overlap = |way: &Vector| (a.farthest(*way) - b.farthest(-*way)).dot(*way) + a.radius + b.radius;
+    ways.iter().chain(&between).map(overlap).fold(f64::INFINITY, f64::min)
 }
 
 fn deeper(a: Meeting, b: Meeting) -> Meeting {

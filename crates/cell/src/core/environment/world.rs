@@ -1,10 +1,8 @@
 //! The bodies and their steps.
 
-use super::convex::Convex;
 use super::object::{Kind, Model};
-use super::overlap::meeting;
 use super::riding::Riding;
-use super::touch::{Joined, Speed, convex};
+use super::touch::{Joined, Speed};
 use rapier3d::math::{Pose as Pose32, Vector};
 use rapier3d::prelude::{
     BroadPhaseBvh, CCDSolver, Collider, ColliderBuilder, ColliderHandle, ColliderSet, Group, ImpulseJointSet,
@@ -99,8 +97,8 @@ pub struct Environment {
     ccd: CCDSolver,
     steps: u64,
     furniture: Vec<Furniture>,
-    /// What can be stood on: collider and name.
-    supports: Vec<(ColliderHandle, String)>,
+    /// Floor and furniture: collider and name.
+    standing: Vec<(ColliderHandle, String)>,
     links: Vec<RobotBody>,
     /// Where the robot's base was at the last step.
     pub(super) base: [f64; 3],
@@ -117,11 +115,13 @@ pub struct Environment {
     pub(super) speeds_before: Vec<(RigidBodyHandle, Speed)>,
 }
 
-/// One body of a robot's link.
+/// One body of a robot's link: a primitive, or a mesh, which has a collider for each of its convex pieces.
 #[derive(Clone)]
 struct RobotBody {
     body: RigidBodyHandle,
-    collider: ColliderHandle,
+    colliders: Vec<ColliderHandle>,
+    /// It is a mesh: the judge has that itself.
+    is_mesh: bool,
     /// It is a finger of the arm of this number.
     finger_of: Option<usize>,
     link: usize,
@@ -196,7 +196,7 @@ impl Environment {
             ccd: CCDSolver::new(),
             steps: saved.steps,
             furniture: furniture.to_vec(),
-            supports: Vec::new(),
+            standing: Vec::new(),
             links: Vec::new(),
             base: configuration.base,
             fingers_solid: vec![true; robot.arm_names().count()],
@@ -374,28 +374,9 @@ impl Environment {
             _ => return,
         }
         let groups = if solid { robot_groups() } else { InteractionGroups::none() };
-        for link in self.links.iter().filter(|link| link.finger_of == Some(arm)) {
-            self.colliders[link.collider].set_collision_groups(groups);
+        for collider in self.links.iter().filter(|link| link.finger_of == Some(arm)).flat_map(|link| &link.colliders) {
+            self.colliders[*collider].set_collision_groups(groups);
         }
-    }
-
-    /// On what an object rests: the deepest level contact. `None` in the air.
-    pub fn rests_on(&self, object: usize) -> Option<Support<'_>> {
-        let mine = &self.objects[object];
-        let others = self.objects.iter().enumerate().filter(|(i, _)| *i != object);
-        let others = others.flat_map(|(i, o)| o.parts.iter().map(move |part| (*part, Support::Object(i))));
-        let fixed = self.supports.iter().map(|(collider, name)| (*collider, Support::Named(name)));
-        let mut best: Option<(f64, Support<'_>)> = None;
-        for (collider, support) in fixed.chain(others) {
-            let below = self.convex(collider);
-            for part in &mine.parts {
-                let Some(touch) = meeting(&below, &self.convex(*part), TOUCH_M) else { continue };
-                if touch.normal.0[2] >= LEVEL && best.is_none_or(|(deepest, _)| touch.depth_m > deepest) {
-                    best = Some((touch.depth_m, support));
-                }
-            }
-        }
-        best.map(|(_, support)| support)
     }
 
     /// An object's body.
@@ -428,15 +409,17 @@ impl Environment {
         digester.finish()
     }
 
-    /// The colliders of the robot, and of which link each is.
-    pub(super) fn link_colliders(&self) -> impl Iterator<Item = (usize, ColliderHandle)> + '_ {
-        self.links.iter().map(|link| (link.link, link.collider))
+    /// The colliders of the primitives of a link.
+    pub(super) fn link_colliders(&self, link: usize) -> impl Iterator<Item = ColliderHandle> + '_ {
+        self.links
+            .iter()
+            .filter(move |body| body.link == link && !body.is_mesh)
+            .flat_map(|body| body.colliders.iter().copied())
     }
 
     /// The colliders of floor and furniture, with their names.
     pub(super) fn fixed_colliders(&self) -> impl Iterator<Item = (&str, ColliderHandle)> + '_ {
-        let fixed = self.supports.iter().filter(|(_, name)| name == FLOOR || !self.is_of_robot(name));
-        fixed.map(|(collider, name)| (name.as_str(), *collider))
+        self.standing.iter().map(|(collider, name)| (name.as_str(), *collider))
     }
 
     /// An object's colliders.
@@ -470,11 +453,6 @@ impl Environment {
         (collider, collider.parent().map(|body| &self.bodies[body]), self.place(collider))
     }
 
-    fn convex(&self, collider: ColliderHandle) -> Convex {
-        let collider = &self.colliders[collider];
-        convex(collider.shape(), &self.place(collider))
-    }
-
     /// A collider's place; its body's, since the last step, may be newer than its own.
     fn place(&self, collider: &Collider) -> Pose32 {
         let parent = collider.parent().map(|body| *self.bodies[body].position());
@@ -497,22 +475,31 @@ impl Environment {
                     .position(to_f32(pose))
                     .friction(ROBOT_FRICTION)
                     .collision_groups(groups(OF_FURNITURE, OF_OBJECTS));
-                self.supports.push((self.colliders.insert(collider), piece.name.clone()));
+                self.standing.push((self.colliders.insert(collider), piece.name.clone()));
             }
         }
     }
 
     fn add_robot(&mut self, robot: &Robot, configuration: &Configuration) {
-        let bodies = robot.model.links.iter().flat_map(|link| &link.bodies);
         let fingers: Vec<Vec<usize>> = (0..robot.arm_names().count()).map(|arm| robot.finger_links_of(arm)).collect();
-        for ((link, pose, shape), of_link) in robot.shapes(configuration).into_iter().zip(bodies) {
-            let name = &robot.model.links[link].name;
-            let body = self.bodies.insert(RigidBodyBuilder::new(LINK).pose(pose));
-            let collider = ColliderBuilder::new(shape).friction(ROBOT_FRICTION).collision_groups(robot_groups());
-            let collider = self.colliders.insert_with_parent(collider, body, &mut self.bodies);
-            self.supports.push((collider, name.clone()));
-            let finger_of = fingers.iter().position(|of_arm| of_arm.contains(&link));
-            self.links.push(RobotBody { body, collider, finger_of, link, pose: of_link.pose, at: pose, stands: false });
+        let poses = robot.poses(configuration);
+        for (link, of_link) in robot.model.links.iter().enumerate() {
+            let primitives = of_link.own_bodies().iter();
+            let primitives = primitives.map(|body| (body.pose, vec![body.geometry.shape(0.0)], false));
+            let meshes = self.joined.surfaces(link).iter();
+            let meshes = meshes.map(|surface| (Pose::IDENTITY, surface.hulls().to_vec(), true));
+            for (pose, shapes, is_mesh) in primitives.chain(meshes).collect::<Vec<_>>() {
+                let at = to_f32(&poses[link].compose(&pose));
+                let body = self.bodies.insert(RigidBodyBuilder::new(LINK).pose(at));
+                let insert = |shape| {
+                    let collider =
+                        ColliderBuilder::new(shape).friction(ROBOT_FRICTION).collision_groups(robot_groups());
+                    self.colliders.insert_with_parent(collider, body, &mut self.bodies)
+                };
+                let colliders = shapes.into_iter().map(insert).collect();
+                let finger_of = fingers.iter().position(|of_arm| of_arm.contains(&link));
+                self.links.push(RobotBody { body, colliders, is_mesh, finger_of, link, pose, at, stands: false });
+            }
         }
     }
 
