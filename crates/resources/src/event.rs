@@ -66,7 +66,8 @@ pub enum Change {
         /// Why.
         reason: EndReason,
     },
-    /// A resource vanished while somebody held it; the rest of the lease stays.
+    /// A resource vanished while somebody held it, and the rest of the lease stayed. Only records of earlier versions tell of that: a lease
+    /// ends before a resource of it is deleted.
     ResourceLost {
         /// The holder's lease.
         lease: LeaseId,
@@ -147,6 +148,8 @@ pub enum EndReason {
     Revoked,
     /// A provider offers its own resource under the id that a task had given to one.
     Displaced,
+    /// A resource that the lease held is gone. Grants are all or nothing, so no lease lives on with the rest.
+    ResourceGone,
 }
 
 impl EndReason {
@@ -167,6 +170,7 @@ impl fmt::Display for EndReason {
             EndReason::Undelivered => "undelivered",
             EndReason::Revoked => "revoked",
             EndReason::Displaced => "displaced by a provider's resource of its id",
+            EndReason::ResourceGone => "a resource of it is gone",
         })
     }
 }

@@ -5,7 +5,8 @@
 //! a new watch shows first is compared with what was offered: a session may have ended and been made anew unnoticed, when the answer of
 //! the manager that said so was lost.
 //! One of what moves ([`Provider::start_at_rest`]) offers nothing at which an earlier goal still runs, and nothing before its driver has said
-//! that it is at rest. One that does not follow the leases of what moves (a process manager's, of its pooled drivers) offers what it has
+//! that it is at rest. What such a provider offers besides, and does not watch (the middle of a table, beside the arms), is offered again when
+//! its bound for standstill has passed. One that does not follow the leases of what moves (a process manager's, of its pooled drivers) offers what it has
 //! offered before, and the manager has lost, when the resource's bound for standstill has passed: those who held it may not have heard yet.
 //! An offer whose answer was lost counts as one that the manager had, and so does what an earlier process offered in the same session.
 //! What the manager has had and refuses now (somebody took a role away) is asked for again, less often.
@@ -352,7 +353,9 @@ impl Shared {
         let missing = |entry: &DesiredState| entry.resource.is_some() && entry.presence != Presence::There;
         desired.states.get(id).is_some_and(missing)
             && match &self.leases {
-                Some(leases) => !leases.is_at_rest(id),
+                Some(leases) if leases.watches(id) => !leases.is_at_rest(id),
+                // Nobody knows which goals run beside it.
+                Some(leases) => !leases.is_brought_to_rest() || desired.bounds.may_move(id),
                 None => desired.bounds.may_move(id),
             }
     }

@@ -149,6 +149,11 @@ impl LeaseWatch {
         &self.shared.resources
     }
 
+    /// Whether a resource of this id is among them.
+    pub(crate) fn watches(&self, id: &str) -> bool {
+        self.shared.resources.iter().any(|resource| resource == id)
+    }
+
     /// What the resource manager has said of a claimed lease until now.
     pub fn check(&self, claim: &Claim<'_>) -> ClaimStatus {
         let standing = self.shared.holdings().check(claim);
@@ -179,6 +184,11 @@ impl LeaseWatch {
         self.shared.heard.send_modify(|heard| *heard += 1);
     }
 
+    /// Whether the driver has said [`LeaseWatch::brought_to_rest`].
+    pub(crate) fn is_brought_to_rest(&self) -> bool {
+        *self.shared.is_brought_to_rest.borrow()
+    }
+
     /// From now on no goal begins before [`LeaseWatch::brought_to_rest`].
     pub(crate) fn begin_at_rest(&self) {
         self.shared.begins_at_rest.store(true, Ordering::SeqCst);
@@ -192,8 +202,7 @@ impl LeaseWatch {
 
     /// Whether the driver has said [`LeaseWatch::brought_to_rest`], and no goal runs at a resource, also none that was told to stop.
     pub fn is_at_rest(&self, resource: &str) -> bool {
-        *self.shared.is_brought_to_rest.borrow()
-            && self.shared.under_way(resource, None).is_none_or(|under_way| under_way.is_empty())
+        self.is_brought_to_rest() && self.shared.under_way(resource, None).is_none_or(|under_way| under_way.is_empty())
     }
 
     /// Follows the manager of a session that provides the resources, for as long as the future is polled; leases are trusted as long
