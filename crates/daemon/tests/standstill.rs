@@ -229,6 +229,28 @@ async fn what_a_lease_loses_beside_its_arm_is_offered_again_when_its_bound_has_p
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_driver_of_a_fixed_session_id_begins_no_goal_of_the_process_before_it_again() {
+    let (system, id) = (TestSystem::new(), || "run/i1/1".to_owned());
+    let manager = system.resource_manager().await;
+    let (holder, next) = (system.client(&manager, "holder").await, system.client(&manager, "next").await);
+    let first = Driver::start_as("driver".to_owned(), &system, &manager, BOUND).await;
+    let (held, _) = in_time(acquire(&holder.resources)).await;
+    in_time(first.begins(id(), &system, &held)).await.unwrap();
+    // As if it were killed: the manager is told nothing.
+    let Driver { session, provider, _watching, .. } = first;
+    drop((provider, _watching));
+    session.abandon().await;
+    let second = Driver::start_as("driver".to_owned(), &system, &manager, BOUND).await;
+    let refused = in_time(second.begins(id(), &system, &held)).await.unwrap_err();
+    assert!(refused.contains("acquire it anew"), "{refused}");
+    assert!(holder.resources.release(held.id).await.unwrap());
+    let (granted, _) = in_time(acquire(&next.resources)).await;
+    in_time(second.begins(fresh_id("goal"), &system, &granted)).await.unwrap();
+    second.stands.add_permits(1);
+    manager.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn what_nothing_moves_for_is_granted_at_once_and_what_its_holder_gives_back_too() {
     let system = TestSystem::new();
     let manager = system.resource_manager().await;

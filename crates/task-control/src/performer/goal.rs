@@ -275,7 +275,8 @@ impl Performing {
     }
 
     /// Whether a provider that does not know the goal was never given it. It could also be another process since, or have forgotten
-    /// it; but then the session that the resource is bound to would not live on, and under the goal's lease nobody else gives it any.
+    /// it; but then the session that the resource is bound to would not live on, and under the goal's lease nobody else gives it any. Where
+    /// the session does live on, because its id is fixed, the other process refuses the lease, and the goal is not begun again.
     async fn would_be_known(&self, endpoint: &Endpoint) -> bool {
         let Some((lease, provider)) = self.provider(endpoint) else { return false };
         let owner = async || {

@@ -6,6 +6,9 @@
 //! ```
 //! While the watch is interrupted nothing is confirmed, so that nothing begins, and nothing has ended, so that what is under way goes on. Lease ids grow with the grants: an id
 //! beyond every one heard of may have been granted a moment ago, any other that holds nothing has ended or never was.
+//!
+//! A process that finds its session living took it over from another process. Leases up to the youngest of its first snapshot may be that one's:
+//! nobody knows which goals it began under them, and they are refuted for good.
 
 use super::standstill::{Ending, Endings};
 use ratn_model::id::{FencingToken, LeaseId};
@@ -73,7 +76,21 @@ pub struct Holdings {
     /// The session that provides the resources: what another one provides under their ids is not this provider. `None` before a manager is
     /// followed, as in tests that tell everything themselves.
     owner: Option<String>,
+    /// What was granted before this process.
+    before: Before,
     contact: Contact,
+}
+
+/// Which leases may be those of a process before this one.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+enum Before {
+    /// None: the session is this process's.
+    #[default]
+    Nothing,
+    /// Those of the first snapshot, which has not come.
+    FirstSnapshot,
+    /// All up to this one.
+    UpTo(LeaseId),
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -98,6 +115,7 @@ impl Default for Holdings {
             endings: Endings::default(),
             youngest: LeaseId(0),
             owner: None,
+            before: Before::default(),
             contact: Contact::Unheard(NEVER_HEARD.to_owned()),
         }
     }
@@ -110,6 +128,12 @@ impl Holdings {
             return ClaimStatus::Unheard(reason.clone());
         }
         let Claim { resource, lease, token, session } = *claim;
+        if matches!(self.before, Before::UpTo(youngest) if lease <= youngest) {
+            return ClaimStatus::Refuted(format!(
+                "{lease} of {resource} was granted before the provider's process was started again, which does not know what was begun under it: \
+                 acquire it anew"
+            ));
+        }
         let holders = self.by_resource.get(resource);
         match holders.and_then(|holders| holders.get(&lease)) {
             Some(holder) if holder.token != token => ClaimStatus::Refuted(format!(
@@ -147,9 +171,12 @@ impl Holdings {
         )
     }
 
-    /// A new watch begins, of resources that the session `owner` provides.
-    pub fn begin(&mut self, owner: &str) {
-        self.owner = Some(owner.to_owned());
+    /// A new watch begins, of resources that the session `owner` provides. Before the first watch, `found` says that the session lived when this
+    /// process opened it.
+    pub fn begin(&mut self, owner: &str, found: bool) {
+        if self.owner.replace(owner.to_owned()).is_none() && found {
+            self.before = Before::FirstSnapshot;
+        }
     }
 
     /// The watch tells something; what has ended with it.
@@ -166,6 +193,9 @@ impl Holdings {
                     ended.extend(self.set(&resource.id, holders, reason));
                 }
                 self.youngest = *youngest;
+                if self.before == Before::FirstSnapshot {
+                    self.before = Before::UpTo(*youngest);
+                }
                 self.contact = Contact::Heard;
                 ended
             }
@@ -389,10 +419,10 @@ mod tests {
     #[test]
     fn a_resource_that_another_session_provides_under_the_same_id_is_not_this_provider() {
         let mut holdings = Holdings::default();
-        holdings.begin("another cell");
+        holdings.begin("another cell", false);
         holdings.tell(&snapshot(&[arm(&[7])], 7));
         refuted(&holdings, claim(7), "no lease holds it");
-        holdings.begin("cell");
+        holdings.begin("cell", true);
         holdings.tell(&snapshot(&[arm(&[8])], 8));
         assert_eq!(holdings.check(&claim(8)), ClaimStatus::Confirmed);
     }

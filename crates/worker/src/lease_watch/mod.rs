@@ -382,22 +382,23 @@ impl LeaseWatch {
     }
 
     async fn try_begin(&self, source: &Source, patience: Duration) -> Result<Following, CallError> {
-        let (client, owner, generation) = match source {
+        let (client, owner, generation, found) = match source {
             Source::Session { client, state, id, .. } => {
                 // A session that is closed tells nothing more, and this watch ends with it.
                 let mut state = state.clone();
-                let Ok(generation) = state.wait_for(|s| s.alive).await.map(|s| s.generation) else { pending().await };
-                (ResourceClient::clone(client), id.as_str(), generation)
+                let Ok(now) = state.wait_for(|s| s.alive).await.map(|s| s.clone()) else { pending().await };
+                // What was made anew has nothing of before.
+                (ResourceClient::clone(client), id.as_str(), now.generation, now.found && now.generation == 1)
             }
             Source::Location { channels, location, provider_session } => {
                 let manager = location.find().await;
-                (ResourceClient::new(channels, &manager, "")?, provider_session.as_str(), 0)
+                (ResourceClient::new(channels, &manager, "")?, provider_session.as_str(), 0, false)
             }
         };
         let answered = Arc::new(Answered(Mutex::new(self.shared.clock.now())));
         let mut stream = client.watch_resources(self.shared.resources.iter().cloned()).await?;
         let first = stream.next().await?;
-        self.shared.holdings().begin(owner);
+        self.shared.holdings().begin(owner, found);
         *self.shared.trust.lock().unwrap_or_else(PoisonError::into_inner) = match source {
             Source::Session { belief, .. } => Trust::Session(belief.clone()),
             Source::Location { .. } => Trust::Answers(Arc::clone(&answered), patience),
