@@ -32,6 +32,11 @@ impl Chain {
         }
         Chain { joints, tip }
     }
+
+    /// How many joints from the root on two chains have in common: both ends move alike with these.
+    pub(crate) fn shared_with(&self, other: &Chain) -> usize {
+        self.joints.iter().zip(&other.joints).take_while(|(a, b)| a == b).count()
+    }
 }
 
 /// The levers of a chain, from its root to its end.
@@ -60,6 +65,11 @@ impl Levers {
         }
         levers.reverse();
         Levers(levers)
+    }
+
+    /// Those behind so many joints from the root.
+    pub(crate) fn behind(&self, joints: usize) -> Levers {
+        Levers(self.0[joints..].to_vec())
     }
 
     /// How far the end moves at the most per radian of each joint (per metre of one that slides), in metres.
