@@ -67,6 +67,11 @@ struct Driver {
 
 impl Driver {
     async fn start(system: &TestSystem, manager: &Daemon, bound: Duration) -> Driver {
+        Driver::start_as(fresh_id("driver"), system, manager, bound).await
+    }
+
+    /// In the session of this id.
+    async fn start_as(session: String, system: &TestSystem, manager: &Daemon, bound: Duration) -> Driver {
         let place = tempfile::tempdir().unwrap();
         let (told, stands, motions) = (Arc::new(Semaphore::new(0)), Arc::new(Semaphore::new(0)), Arc::default());
         let leases = LeaseWatch::of([ARM]);
@@ -76,7 +81,7 @@ impl Driver {
         let bound_at = bind(&Endpoint::Unix(place.path().join("driver.sock"))).await.unwrap();
         let endpoint = bound_at.endpoint().clone();
         tokio::spawn(bound_at.serve(Services::new().with(server.into_service()), CancellationToken::new()));
-        let session = Session::open(&system.channels, &manager.endpoint, "driver", DEADLINE);
+        let session = Session::open_as(&system.channels, &manager.endpoint, session, "driver", DEADLINE);
         let watch = leases.follow_session(&system.channels, &manager.endpoint, &session, DEADLINE).unwrap();
         let provider = Provider::start_at_rest(&system.channels, &manager.endpoint, &session, &leases).unwrap();
         in_time(session.alive(DEADLINE)).await.unwrap();
@@ -88,12 +93,16 @@ impl Driver {
 
     /// A motion under a lease, once it has begun.
     async fn moves(&self, system: &TestSystem, lease: &Lease) {
+        in_time(self.begins(fresh_id("goal"), system, lease)).await.unwrap();
+    }
+
+    /// The same for a goal of this id; an error where it ends without having begun.
+    async fn begins(&self, id: String, system: &TestSystem, lease: &Lease) -> Result<(), String> {
         let (begun, began) = tokio::sync::oneshot::channel();
         let mut begun = Some(begun);
         let (client, endpoint) = (ActionClient::new(system.channels.clone()), self.endpoint.clone());
-        let goal =
-            Goal { id: fresh_id("goal"), action: "move".to_owned(), lease: Some(lease.clone()), ..Goal::default() };
-        tokio::spawn(async move {
+        let goal = Goal { id, action: "move".to_owned(), lease: Some(lease.clone()), ..Goal::default() };
+        let ended = tokio::spawn(async move {
             client
                 .execute(&endpoint, goal, |_, _| {
                     if let Some(begun) = begun.take() {
@@ -102,7 +111,10 @@ impl Driver {
                 })
                 .await
         });
-        in_time(began).await.unwrap();
+        match began.await {
+            Ok(()) => Ok(()),
+            Err(_) => Err(ended.await.unwrap().unwrap_err().to_string()),
+        }
     }
 
     fn last(&self) -> Option<Instant> {
@@ -155,6 +167,89 @@ async fn what_a_holder_loses_is_granted_when_its_motion_stands_still_and_not_bef
     }
 }
 
+/// What an arm must hold besides: no goal runs at it, so that nobody but its bound says when nothing moves there.
+fn way(bound: Duration) -> Resource {
+    Resource::new("way@here", ResourceClass::System, "Way").with_standstill(bound)
+}
+
+async fn acquire_both(client: &ResourceClient) -> Lease {
+    let options = AcquireOptions { deadline: DEADLINE, ..AcquireOptions::default() };
+    in_time(client.acquire(vec![block("Arm"), block("Way")], options)).await.unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_arm_whose_lease_loses_something_else_is_told_to_stop_and_granted_when_it_stands_still() {
+    for its_session_ends in [false, true] {
+        let system = TestSystem::new();
+        let manager = system.resource_manager().await;
+        let driver = Driver::start(&system, &manager, BOUND).await;
+        let furniture = system.client(&manager, "furniture").await;
+        furniture.resources.create(way(BOUND)).await.unwrap();
+        let (holder, next) = (system.client(&manager, "holder").await, system.client(&manager, "next").await);
+        let held = acquire_both(&holder.resources).await;
+        driver.moves(&system, &held).await;
+        let operator = ResourceClient::new(&system.channels, &manager.endpoint, "").unwrap();
+        match its_session_ends {
+            true => furniture.session.close().await,
+            false => operator.delete("way@here").await.unwrap(),
+        }
+        in_time(driver.told.acquire()).await.unwrap().forget();
+        let granted = {
+            let client = next.resources.clone();
+            tokio::spawn(async move { acquire(&client).await })
+        };
+        tokio::time::sleep(Duration::from_millis(300)).await;
+        assert!(!granted.is_finished() && driver.last().is_none());
+        driver.stands.add_permits(1);
+        let (_, at) = in_time(granted).await.unwrap();
+        assert!(driver.last().is_some_and(|stood| stood <= at));
+        assert!(!holder.resources.release(held.id).await.unwrap(), "the lease is over");
+        manager.end().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_a_lease_loses_beside_its_arm_is_offered_again_when_its_bound_has_passed() {
+    const SHORT: Duration = Duration::from_millis(1_500);
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let driver = Driver::start(&system, &manager, BOUND).await;
+    assert!(in_time(driver.provider.offer(way(SHORT))).await.unwrap());
+    let (holder, next) = (system.client(&manager, "holder").await, system.client(&manager, "next").await);
+    let held = acquire_both(&holder.resources).await;
+    driver.moves(&system, &held).await;
+    let operator = ResourceClient::new(&system.channels, &manager.endpoint, "").unwrap();
+    let deleted = Instant::now();
+    operator.delete("way@here").await.unwrap();
+    let options = AcquireOptions { deadline: DEADLINE, ..AcquireOptions::default() };
+    in_time(next.resources.acquire(vec![block("Way")], options)).await.unwrap();
+    let after = deleted.elapsed();
+    assert!(after >= SHORT, "granted {} ms after it was lost", after.as_millis());
+    manager.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_driver_of_a_fixed_session_id_begins_no_goal_of_the_process_before_it_again() {
+    let (system, id) = (TestSystem::new(), || "run/i1/1".to_owned());
+    let manager = system.resource_manager().await;
+    let (holder, next) = (system.client(&manager, "holder").await, system.client(&manager, "next").await);
+    let first = Driver::start_as("driver".to_owned(), &system, &manager, BOUND).await;
+    let (held, _) = in_time(acquire(&holder.resources)).await;
+    in_time(first.begins(id(), &system, &held)).await.unwrap();
+    // As if it were killed: the manager is told nothing.
+    let Driver { session, provider, _watching, .. } = first;
+    drop((provider, _watching));
+    session.abandon().await;
+    let second = Driver::start_as("driver".to_owned(), &system, &manager, BOUND).await;
+    let refused = in_time(second.begins(id(), &system, &held)).await.unwrap_err();
+    assert!(refused.contains("acquire it anew"), "{refused}");
+    assert!(holder.resources.release(held.id).await.unwrap());
+    let (granted, _) = in_time(acquire(&next.resources)).await;
+    in_time(second.begins(fresh_id("goal"), &system, &granted)).await.unwrap();
+    second.stands.add_permits(1);
+    manager.end().await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn what_nothing_moves_for_is_granted_at_once_and_what_its_holder_gives_back_too() {
     let system = TestSystem::new();
@@ -187,7 +282,7 @@ async fn a_motion_that_does_not_stop_is_never_confirmed_and_the_bound_decides() 
     let (lease, at) = in_time(acquire(&next.resources)).await;
     assert!(at - revoked >= SHORT && driver.last().is_none());
     // And still nothing begins beside it.
-    let waits = tokio::time::timeout(Duration::from_millis(300), driver.moves(&system, &lease));
+    let waits = tokio::time::timeout(Duration::from_millis(300), driver.begins(fresh_id("goal"), &system, &lease));
     assert!(waits.await.is_err());
     driver.stands.add_permits(1);
     manager.end().await;

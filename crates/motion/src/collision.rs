@@ -4,20 +4,21 @@
 //! arm moves (links, hand, fingers, the held object) an array of moving shapes. Bounding spheres decide most pairs, distances
 //! decide the rest. Which links are to be kept apart the mechanism says ([`arm::holding`](crate::arm::holding)). It says what touches what and how deep, and where contact is allowed; free motions are searched with the
 //! vector checks of `arm` and `space`. Shapes that move are grown by a padding. Between two postures no further apart than [`Checker::steps`]
-//! allows, no point is further than the padding from its place in the nearer one: where both are free, the way between is. Meshes are looked at as they
-//! are. Links whose spheres say nothing of each other ([`Checks::by_shapes`](crate::pairs::Checks::by_shapes)) may be built to run closer to each other than
-//! the padding, and have none: of those the finished motion is checked, from posture to posture (`validate`).
+//! allows, nothing is nearer to anything else by more than the padding than in the nearer one: where both are free, the way between is. Meshes are looked
+//! at as they are. Links whose spheres say nothing of each other ([`Checks::by_shapes`](crate::pairs::Checks::by_shapes)) may be built to run closer to each
+//! other than the padding, and have none: of those the finished motion is checked, from posture to posture (`validate`).
 
 use crate::cloud::Cloud;
 use crate::confirmed::Couples;
 use crate::frame::{compose, norm};
 use crate::joint_vector::JointVector;
 use crate::keep::Region;
-use crate::levers::Levers;
+use crate::levers::{Chain, Levers};
 use crate::mechanism::Mechanism;
 use crate::pairs::Pair;
 use crate::request::kept_out;
 use crate::robot::{Configuration, Geometry, Robot, to_f32};
+use crate::robot_model::Joint;
 use crate::solid::{Placed, Solid};
 use parry3d::math::{Pose as Pose32, Vector};
 use ratn_model::pose::Pose;
@@ -58,7 +59,8 @@ pub struct Checker<'a> {
     close: BTreeSet<Pair>,
     /// Balls that stand around, in the world frame.
     cloud: Option<Arc<Cloud>>,
-    /// How far a point moves at the most per radian of each arm joint (per metre of one that slides), in metres.
+    /// How far a point moves at the most per radian of each arm joint (per metre of one that slides), or two shapes that move towards each
+    /// other, in metres.
     reach: JointVector,
     poses: Vec<Pose>,
     placed: Vec<Pose32>,
@@ -228,7 +230,6 @@ impl<'a> Checker<'a> {
         self.cloud = self.cloud.filter(|cloud| couples.beside.iter().any(|(_, name)| *name == cloud.name));
         let name = self.cloud.as_ref().map(|cloud| cloud.name.clone());
         self.forget_idle(|link| name.as_ref().is_some_and(|name| beside(link, name)));
-        self.reach = JointVector::zeros(self.reach.len());
         self.find_reach();
         self
     }
@@ -334,16 +335,32 @@ impl<'a> Checker<'a> {
         self.close = arm.by_shapes.iter().copied().filter(|(a, b)| arm.is_by_meshes(*a, *b)).collect();
     }
 
-    /// The farthest that any of the shapes moves.
     fn find_reach(&mut self) {
-        let joints = self.reach.len();
-        for moving in &self.moving {
-            let chain = self.robot.arm_chain(&self.configuration, moving.frame);
+        let (robot, at) = (self.robot, self.configuration);
+        self.reach = self.farthest(robot.arm_joints(), |link| robot.arm_chain(&at, link));
+    }
+
+    /// The farthest that any of the shapes moves with these joints, or that two of a pair move towards each other.
+    fn farthest(&self, joints: &[Joint], chain_to: impl Fn(usize) -> Chain) -> JointVector {
+        let levers_of = |moving: &Moving| {
+            let chain = chain_to(moving.frame);
             let middle = moving.middle.to_array().map(f64::from);
             let end_m = norm(chain.tip.compose(&moving.local).transform(middle)) + f64::from(moving.radius);
-            let shape = Levers::new(&chain.joints, end_m, self.robot.arm_joints()).per_joint(joints);
-            self.reach = JointVector::from_fn(joints, |j| self.reach[j].max(shape[j]));
-        }
+            let levers = Levers::new(&chain.joints, end_m, joints);
+            (chain, levers)
+        };
+        let all: Vec<(Chain, Levers)> = self.moving.iter().map(levers_of).collect();
+        let alone = all.iter().map(|(_, levers)| levers.per_joint(joints.len()));
+        let towards_each_other = self.pairs.iter().filter_map(|(i, j)| {
+            let ((chain, levers), (other, other_levers)) = (&all[*i], &all[*j]);
+            let shared = chain.shared_with(other);
+            // Where one chain goes on from the end of the other, it alone moves.
+            let branches = shared < chain.joints.len().min(other.joints.len());
+            let [a, b] = [levers, other_levers].map(|levers| levers.behind(shared).per_joint(joints.len()));
+            branches.then(|| JointVector::from_fn(joints.len(), |j| a[j] + b[j]))
+        });
+        let greater = |a: JointVector, b: JointVector| JointVector::from_fn(joints.len(), |j| a[j].max(b[j]));
+        alone.chain(towards_each_other).fold(JointVector::zeros(joints.len()), greater)
     }
 
     /// The links that are kept apart, by their indices in the arm with what it holds ([`arm::holding`](crate::arm::holding)), the lower first.
@@ -366,8 +383,8 @@ impl<'a> Checker<'a> {
         self.padding
     }
 
-    /// Into how many equal steps the straight line between two postures must be cut so that no point of the robot moves
-    /// further than twice the padding in one.
+    /// Into how many equal steps the straight line between two postures must be cut so that in one no point of the robot moves further than
+    /// twice the padding, and no two shapes come nearer to each other by more than that.
     pub fn steps(&self, from: &JointVector, to: &JointVector) -> usize {
         let moved: f64 = (0..self.reach.len()).map(|j| (to[j] - from[j]).abs() * self.reach[j]).sum();
         let step = if self.padding > 0.0 { 2.0 * self.padding } else { UNPADDED_STEP_M };
@@ -398,7 +415,8 @@ impl<'a> Checker<'a> {
             && self.obstacles.iter().any(|obstacle| obstacle.name == collision.other)
     }
 
-    /// How far any point of the robot moves at the most when the joints move by so much, in metres.
+    /// How far any point of the robot moves, or two of its shapes move towards each other, at the most when the joints move by so much, in
+    /// metres.
     pub(crate) fn moves_m(&self, turns: &JointVector) -> f64 {
         (0..self.reach.len()).map(|j| turns[j].abs() * self.reach[j]).sum()
     }

@@ -33,6 +33,11 @@ impl Chain {
         }
         Chain { joints, tip }
     }
+
+    /// How many joints from the root on two chains have in common: both ends move alike with these.
+    pub(crate) fn shared_with(&self, other: &Chain) -> usize {
+        self.joints.iter().zip(&other.joints).take_while(|(a, b)| a == b).count()
+    }
 }
 
 /// The levers of a chain, from its root to its end.
@@ -61,6 +66,11 @@ impl Levers {
         }
         levers.reverse();
         Levers(levers)
+    }
+
+    /// The levers behind this many joints from the root.
+    pub(crate) fn behind(&self, joints: usize) -> Levers {
+        Levers(self.0[joints..].to_vec())
     }
 
     /// Maximum motion of the end per radian of each joint (per metre of a prismatic one), in metres.

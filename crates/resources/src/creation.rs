@@ -8,6 +8,7 @@ use crate::pool::Pool;
 use crate::record::Effect;
 use crate::resource::{Description, LONGEST_STANDSTILL_MS, Resource, ResourceSpec, ResourceView, STANDSTILL_ATTRIBUTE};
 use crate::session::Session;
+use ratn_model::id::LeaseId;
 use ratn_model::resource::{Quantity, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
@@ -16,7 +17,7 @@ use std::sync::Arc;
 impl Pool {
     /// Adds a resource, bound to a session if one is given. A resource of the same id and owner is updated: the kind
     /// stays, its attributes and capacity are replaced (holders keep what they hold); where they are equal nothing changes. One of the id that a task has made gives way to a
-    /// provider's: it is deleted, and who holds it loses it.
+    /// provider's: it is deleted, and the leases of it end.
     ///
     /// # Errors
     /// An unknown session, an id that another owner's resource has and that does not give way, a malformed or too large description.
@@ -39,7 +40,7 @@ impl Pool {
         match before {
             Some((slot, resource)) if resource.owner.as_ref() != session && self.gives_way(resource, spec.class) => {
                 self.check_room(session, 1)?;
-                self.commit(Effect::ResourceDeleted { slot, reason: EndReason::Displaced });
+                self.remove(slot, EndReason::Displaced);
                 self.add(session, spec, id.clone(), numbered);
             }
             Some((_, resource)) if resource.owner.as_ref() != session || resource.description.kind != spec.kind => {
@@ -78,7 +79,8 @@ impl Pool {
             && owner.is_some_and(Session::is_no_operators)
     }
 
-    /// Removes a resource; holders hear [`crate::Change::ResourceLost`]. `None` as session may delete anything.
+    /// Removes a resource. Every lease that holds something of it ends as a whole ([`EndReason::ResourceGone`]). `None` as session may delete
+    /// anything.
     ///
     /// # Errors
     /// An unknown resource, or one that belongs to another session.
@@ -87,9 +89,23 @@ impl Pool {
         let found = self.resources.find(id).and_then(|slot| Some((slot, self.resources.get(slot)?)));
         let (slot, resource) = found.ok_or_else(|| PoolError::UnknownResource { id: id.to_owned() })?;
         may_delete(resource, session)?;
-        self.commit(Effect::ResourceDeleted { slot, reason: EndReason::Asked });
+        self.remove(slot, EndReason::Asked);
         self.schedule();
         Ok(())
+    }
+
+    /// Deletes a resource, when every lease of it has ended.
+    fn remove(&mut self, slot: Slot, reason: EndReason) {
+        while let Some(lease) = self.lease_of(slot) {
+            self.commit(Effect::LeaseEnded { lease, reason: EndReason::ResourceGone });
+        }
+        self.commit(Effect::ResourceDeleted { slot, reason });
+    }
+
+    /// A live lease that holds something of a resource.
+    pub(crate) fn lease_of(&self, slot: Slot) -> Option<LeaseId> {
+        let holders = self.resources.get(slot)?.holders.iter();
+        holders.map(|(lease, _)| *lease).find(|lease| self.leases.contains_key(lease))
     }
 
     /// Removes so much in all of what is free, fits and may be deleted by its id ([`Pool::delete`]), for good; a resource of which

@@ -66,7 +66,8 @@ pub enum Change {
         /// The reason.
         reason: EndReason,
     },
-    /// A resource was deleted while a lease held it; the lease keeps its other resources.
+    /// A resource was deleted while a lease held it, and the lease kept its other resources. Only records of earlier versions have this event:
+    /// now a lease ends before one of its resources is deleted.
     ResourceLost {
         /// The holder's lease.
         lease: LeaseId,
@@ -147,6 +148,8 @@ pub enum EndReason {
     Revoked,
     /// A provider offers its own resource under the id that a task had given to one.
     Displaced,
+    /// A resource that the lease held is gone. Grants are all or nothing, so no lease lives on with the rest.
+    ResourceGone,
 }
 
 impl EndReason {
@@ -167,6 +170,7 @@ impl fmt::Display for EndReason {
             EndReason::Undelivered => "undelivered",
             EndReason::Revoked => "revoked",
             EndReason::Displaced => "displaced by a provider's resource of its id",
+            EndReason::ResourceGone => "a resource of it is gone",
         })
     }
 }

@@ -341,8 +341,17 @@ impl Pool {
                     false => (Effect::TaskEnded { session: id.clone() }, session.consumed.len()),
                 }
             } else if let Some(&slot) = session.provides.first() {
-                let holders = self.resources.get(slot).map_or(0, |resource| resource.holders.len());
-                (Effect::ResourceDeleted { slot, reason }, holders)
+                match self.lease_of(slot) {
+                    Some(lease) => {
+                        let held = self.leases.get(&lease).map_or(0, |record| record.held.len());
+                        (Effect::LeaseEnded { lease, reason: EndReason::ResourceGone }, held)
+                    }
+                    // What leases have left of it goes with it.
+                    None => {
+                        let left = self.resources.get(slot).map_or(0, |resource| resource.holders.len());
+                        (Effect::ResourceDeleted { slot, reason }, left)
+                    }
+                }
             } else {
                 (Effect::SessionEnded { session: id.clone() }, 0)
             };

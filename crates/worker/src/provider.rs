@@ -5,10 +5,12 @@
 //! The first snapshot of a new watch is compared with the offered resources: the session may have ended and been made again unnoticed, if
 //! the manager's answer about that was lost.
 //! A provider of hardware that moves ([`Provider::start_at_rest`]) does not offer a resource on which an earlier goal still runs, and
-//! offers nothing before its driver has reported rest. A provider that does not follow the leases of what moves (a process manager, for its
-//! pooled drivers) offers a resource that the manager has lost again only when the resource's bound for standstill has passed: its former
-//! holders may not have heard yet. An offer whose answer was lost counts as accepted, and so do the offers of an earlier process in the
-//! same session. If the manager had a resource and refuses it now (somebody took a role away), it is offered again, less often.
+//! offers nothing before its driver has reported rest. A resource that such a provider offers but does not watch (the middle of a table,
+//! beside the arms) is offered again when its bound for standstill has passed. A provider that does not follow the leases of what moves (a
+//! process manager, for its pooled drivers) offers a resource that the manager has lost again only when the resource's bound for standstill
+//! has passed: its former holders may not have heard yet. An offer whose answer was lost counts as accepted, and so do the offers of an
+//! earlier process in the same session. If the manager had a resource and refuses it now (somebody took a role away), it is offered again,
+//! less often.
 
 mod bounds;
 
@@ -352,7 +354,9 @@ impl Shared {
         let missing = |entry: &DesiredState| entry.resource.is_some() && entry.presence != Presence::There;
         desired.states.get(id).is_some_and(missing)
             && match &self.leases {
-                Some(leases) => !leases.is_at_rest(id),
+                Some(leases) if leases.watches(id) => !leases.is_at_rest(id),
+                // Nobody knows which goals run beside it.
+                Some(leases) => !leases.is_brought_to_rest() || desired.bounds.may_move(id),
                 None => desired.bounds.may_move(id),
             }
     }

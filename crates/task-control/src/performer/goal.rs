@@ -274,7 +274,8 @@ impl Performing {
     }
 
     /// Whether a provider that does not know the goal was never given it. It could also be a new process, or have forgotten the goal; but then the
-    /// session of the resource would not live on, and nobody else gives goals under this goal's lease.
+    /// session of the resource would not live on, and nobody else gives goals under this goal's lease. Where the session does live on, because its
+    /// id is fixed, the new process refuses the lease, and the goal is not begun again.
     async fn would_be_known(&self, endpoint: &Endpoint) -> bool {
         let Some((lease, provider)) = self.provider(endpoint) else { return false };
         let owner = async || {

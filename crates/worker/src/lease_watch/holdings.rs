@@ -7,6 +7,9 @@
 //! While the watch is interrupted, no claim is confirmed, so that no goal begins; and no lease counts as ended, so that goals under way go
 //! on. Lease ids grow with the grants: an id beyond every known one may have been granted a moment ago; any other id that holds nothing has
 //! ended or never existed.
+//!
+//! A process that finds its session living took it over from another process. Leases up to the youngest of its first snapshot may be that
+//! process's: nobody knows which goals it began under them, so they are refuted for good.
 
 use super::standstill::{Ending, Endings};
 use ratn_model::id::{FencingToken, LeaseId};
@@ -74,7 +77,21 @@ pub struct Holdings {
     /// The session that provides the resources: resources that another session provides under the same ids are not this provider's. `None`
     /// before a manager is followed, as in tests that send all updates themselves.
     owner: Option<String>,
+    /// What was granted before this process.
+    before: Before,
     contact: Contact,
+}
+
+/// Which leases may be those of a process before this one.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+enum Before {
+    /// None: the session is this process's.
+    #[default]
+    Nothing,
+    /// Those of the first snapshot, which has not come.
+    FirstSnapshot,
+    /// All up to this one.
+    UpTo(LeaseId),
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -99,6 +116,7 @@ impl Default for Holdings {
             endings: Endings::default(),
             youngest: LeaseId(0),
             owner: None,
+            before: Before::default(),
             contact: Contact::Unheard(NEVER_HEARD.to_owned()),
         }
     }
@@ -111,6 +129,12 @@ impl Holdings {
             return ClaimStatus::Unheard(reason.clone());
         }
         let Claim { resource, lease, token, session } = *claim;
+        if matches!(self.before, Before::UpTo(youngest) if lease <= youngest) {
+            return ClaimStatus::Refuted(format!(
+                "{lease} of {resource} was granted before the provider's process was started again, which does not know what was begun under it: \
+                 acquire it anew"
+            ));
+        }
         let holders = self.by_resource.get(resource);
         match holders.and_then(|holders| holders.get(&lease)) {
             Some(holder) if holder.token != token => ClaimStatus::Refuted(format!(
@@ -148,9 +172,12 @@ impl Holdings {
         )
     }
 
-    /// Begins a new watch of resources that the session `owner` provides.
-    pub fn begin(&mut self, owner: &str) {
-        self.owner = Some(owner.to_owned());
+    /// Begins a new watch of resources that the session `owner` provides. Before the first watch, `found` says that the session lived when this
+    /// process opened it.
+    pub fn begin(&mut self, owner: &str, found: bool) {
+        if self.owner.replace(owner.to_owned()).is_none() && found {
+            self.before = Before::FirstSnapshot;
+        }
     }
 
     /// Applies an update of the watch; returns the holdings that ended by it.
@@ -167,6 +194,9 @@ impl Holdings {
                     ended.extend(self.set(&resource.id, holders, reason));
                 }
                 self.youngest = *youngest;
+                if self.before == Before::FirstSnapshot {
+                    self.before = Before::UpTo(*youngest);
+                }
                 self.contact = Contact::Heard;
                 ended
             }
@@ -390,10 +420,10 @@ mod tests {
     #[test]
     fn a_resource_that_another_session_provides_under_the_same_id_is_not_this_provider() {
         let mut holdings = Holdings::default();
-        holdings.begin("another cell");
+        holdings.begin("another cell", false);
         holdings.tell(&snapshot(&[arm(&[7])], 7));
         refuted(&holdings, claim(7), "no lease holds it");
-        holdings.begin("cell");
+        holdings.begin("cell", true);
         holdings.tell(&snapshot(&[arm(&[8])], 8));
         assert_eq!(holdings.check(&claim(8)), ClaimStatus::Confirmed);
     }

@@ -151,6 +151,11 @@ impl LeaseWatch {
         &self.shared.resources
     }
 
+    /// Whether it watches a resource with this id.
+    pub(crate) fn watches(&self, id: &str) -> bool {
+        self.shared.resources.iter().any(|resource| resource == id)
+    }
+
     /// The standing of a claimed lease by what the resource manager has reported so far.
     pub fn check(&self, claim: &Claim<'_>) -> ClaimStatus {
         let standing = self.shared.holdings().check(claim);
@@ -180,6 +185,11 @@ impl LeaseWatch {
         self.shared.heard.send_modify(|heard| *heard += 1);
     }
 
+    /// Whether the driver has said [`LeaseWatch::brought_to_rest`].
+    pub(crate) fn is_brought_to_rest(&self) -> bool {
+        *self.shared.is_brought_to_rest.borrow()
+    }
+
     /// From now on no goal begins before [`LeaseWatch::brought_to_rest`].
     pub(crate) fn begin_at_rest(&self) {
         self.shared.begins_at_rest.store(true, Ordering::SeqCst);
@@ -193,8 +203,7 @@ impl LeaseWatch {
 
     /// Whether the driver has called [`LeaseWatch::brought_to_rest`], and no goal runs on the resource, not even one that was told to stop.
     pub fn is_at_rest(&self, resource: &str) -> bool {
-        *self.shared.is_brought_to_rest.borrow()
-            && self.shared.under_way(resource, None).is_none_or(|under_way| under_way.is_empty())
+        self.is_brought_to_rest() && self.shared.under_way(resource, None).is_none_or(|under_way| under_way.is_empty())
     }
 
     /// Follows the manager of a session that provides the resources, for as long as the future is polled. Leases are trusted as long as the
@@ -375,22 +384,23 @@ impl LeaseWatch {
     }
 
     async fn try_begin(&self, source: &Source, patience: Duration) -> Result<Following, CallError> {
-        let (client, owner, generation) = match source {
+        let (client, owner, generation, found) = match source {
             Source::Session { client, state, id, .. } => {
                 // A closed session reports nothing more, and this watch ends with it.
                 let mut state = state.clone();
-                let Ok(generation) = state.wait_for(|s| s.alive).await.map(|s| s.generation) else { pending().await };
-                (ResourceClient::clone(client), id.as_str(), generation)
+                let Ok(now) = state.wait_for(|s| s.alive).await.map(|s| s.clone()) else { pending().await };
+                // What was made anew has nothing of before.
+                (ResourceClient::clone(client), id.as_str(), now.generation, now.found && now.generation == 1)
             }
             Source::Location { channels, location, provider_session } => {
                 let manager = location.find().await;
-                (ResourceClient::new(channels, &manager, "")?, provider_session.as_str(), 0)
+                (ResourceClient::new(channels, &manager, "")?, provider_session.as_str(), 0, false)
             }
         };
         let answered = Arc::new(Answered(Mutex::new(self.shared.clock.now())));
         let mut stream = client.watch_resources(self.shared.resources.iter().cloned()).await?;
         let first = stream.next().await?;
-        self.shared.holdings().begin(owner);
+        self.shared.holdings().begin(owner, found);
         *self.shared.trust.lock().unwrap_or_else(PoisonError::into_inner) = match source {
             Source::Session { belief, .. } => Trust::Session(belief.clone()),
             Source::Location { .. } => Trust::Answers(Arc::clone(&answered), patience),

@@ -38,11 +38,9 @@ async fn heard(leases: &LeaseWatch) {
 const CLAIM: Claim<'_> = Claim { resource: "arm@sim", lease: LeaseId(7), token: FencingToken(70), session: "run" };
 
 #[tokio::test]
-async fn a_driver_of_a_fixed_session_id_begins_nothing_before_it_has_said_that_it_is_at_rest() {
+async fn a_driver_begins_nothing_before_it_has_said_that_it_is_at_rest() {
     let (_directory, endpoint) = place();
-    // What the process before this one has left: its session still lives, with the arm, which is held.
     let manager = with_lease();
-    manager.pool.lock().unwrap().sessions.insert("cell".to_owned(), 1);
     let _serving = manager.serve(&endpoint).await;
     let channels = channels();
     let session = Session::open_as(&channels, &endpoint, "cell".to_owned(), "cell", LONG);
@@ -52,6 +50,39 @@ async fn a_driver_of_a_fixed_session_id_begins_nothing_before_it_has_said_that_i
     assert_eq!(leases.check(&CLAIM), ClaimStatus::NotAtRest);
     leases.brought_to_rest();
     assert_eq!(leases.check(&CLAIM), ClaimStatus::Confirmed);
+}
+
+#[tokio::test]
+async fn a_driver_that_finds_its_session_living_refuses_the_leases_of_the_process_before_it_for_good() {
+    let (_directory, endpoint) = place();
+    let manager = with_lease();
+    manager.pool.lock().unwrap().sessions.insert("cell".to_owned(), 1);
+    let (stop, serving) = manager.serve(&endpoint).await;
+    let channels = channels();
+    let session = Session::open_as(&channels, &endpoint, "cell".to_owned(), "cell", LONG);
+    let leases = LeaseWatch::of(["arm@sim"]);
+    leases.brought_to_rest();
+    tokio::spawn(leases.follow_session(&channels, &endpoint, &session, LONG).unwrap());
+    heard(&leases).await;
+    let refused = leases.check(&CLAIM);
+    assert!(matches!(&refused, ClaimStatus::Refuted(why) if why.contains("acquire it anew")), "{refused:?}");
+    // The next watch begins with the lease after it as well.
+    stop.cancel();
+    serving.await.unwrap();
+    {
+        let mut pool = manager.pool.lock().unwrap();
+        let next = Holding { lease_id: 8, token: 80, units: 1.0, session_id: "run".to_owned(), ..Holding::default() };
+        pool.resources.get_mut("arm@sim").unwrap().holdings.push(next);
+        pool.youngest = 8;
+    }
+    let _serving = manager.serve(&endpoint).await;
+    let confirmed = async {
+        while leases.check(&Claim { lease: LeaseId(8), token: FencingToken(80), ..CLAIM }) != ClaimStatus::Confirmed {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    };
+    tokio::time::timeout(LONG, confirmed).await.unwrap();
+    assert!(matches!(leases.check(&CLAIM), ClaimStatus::Refuted(_)));
 }
 
 #[tokio::test]

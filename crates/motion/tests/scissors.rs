@@ -1,0 +1,81 @@
+//! Links on different branches of a robot that move towards each other.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_model::pose::Pose;
+use ratn_model::value::{Trajectory, TrajectoryPoint};
+use ratn_motion::collision::{Checker, Contact};
+use ratn_motion::description::RobotDescription;
+use ratn_motion::joint_vector::JointVector;
+use ratn_motion::robot::{Configuration, Robot};
+use ratn_motion::validate::validate_trajectory;
+use ratn_world::scene::Scene;
+
+/// Two levers of 0.5 m, whose tips are boxes of `edge` metres; one joint turns the tips past each other, as the second lever mimics the first.
+fn scissors(edge: f64) -> Robot {
+    let lever = |name: &str, origin: &str, mimic: &str| {
+        format!(
+            "<link name='{name}'><collision><origin xyz='0.5 0 0'/><geometry><box size='{edge} {edge} {edge}'/></geometry></collision></link>\
+             <joint name='{name}_turns' type='revolute'><parent link='foot'/><child link='{name}'/><origin {origin}/><axis xyz='0 0 1'/>\
+             <limit lower='-1' upper='1' velocity='1' effort='1'/>{mimic}</joint>"
+        )
+    };
+    let urdf = format!(
+        "<robot name='scissors'><link name='foot'/>{}{}</robot>",
+        lever("first", "xyz='0 0 0'", ""),
+        lever("second", "xyz='1 0 0' rpy='0 0 3.14159265358979'", "<mimic joint='first_turns'/>")
+    );
+    let description = RobotDescription::read(
+        "name = \"scissors\"\nurdf = \"s.urdf\"\n[arm]\njoints = [\"first_turns\"]\ntool = \"first\"\n",
+    );
+    let srdf = "<robot name='scissors'/>";
+    Robot::of(description.unwrap(), &urdf, Some(srdf), &mut |_| unreachable!("it has no meshes")).unwrap()
+}
+
+const EDGES_M: [f64; 4] = [0.02, 0.04, 0.06, 0.1];
+
+#[test]
+fn a_trajectory_on_which_two_links_pass_through_each_other_between_its_knots_is_refused() {
+    for edge in EDGES_M {
+        let robot = scissors(edge);
+        let scene = Scene { base: Pose::IDENTITY, objects: Vec::new() };
+        let here = Configuration { arm: JointVector::of([-0.5]), ..robot.at_zero() };
+        let knots = [
+            (0.0, -0.5, 0.0),
+            (1.0, -0.5 + 0.2 / 6.0, 0.1),
+            (2.0, -0.3, 0.2),
+            (3.5, 0.0, 0.2),
+            (5.0, 0.3, 0.2),
+            (6.0, 0.5 - 0.2 / 6.0, 0.1),
+            (7.0, 0.5, 0.0),
+        ];
+        // Without the knot at which they meet.
+        for without in [None, Some(3)] {
+            let kept = (0..knots.len()).filter(|knot| Some(*knot) != without).map(|knot| knots[knot]);
+            let points = kept.map(|(time_s, at, velocity)| TrajectoryPoint {
+                time_s,
+                positions: vec![at],
+                velocities: vec![velocity],
+            });
+            let trajectory = Trajectory { joints: vec!["first_turns".to_owned()], points: points.collect() };
+            let refused = validate_trajectory(&robot, &scene, &here, &trajectory, Contact::None);
+            let refused = refused.map(drop).unwrap_err().to_string();
+            assert!(refused.contains("first") && refused.contains("second"), "{edge}: {refused}");
+        }
+    }
+}
+
+#[test]
+fn no_two_links_come_nearer_to_each_other_in_one_step_than_twice_the_padding() {
+    for edge in EDGES_M {
+        let (robot, scene) = (scissors(edge), Scene { base: Pose::IDENTITY, objects: Vec::new() });
+        for padding in [0.0, 0.005, 0.02] {
+            let mut checker = Checker::new(&robot, &scene, &robot.at_zero(), padding);
+            // A quarter of a turn each: both tips go straight at each other around the middle.
+            let [from, to] = [-0.5, 0.5].map(|at| JointVector::of([at]));
+            let step_m = 2.0 * 0.5 / checker.steps(&from, &to) as f64;
+            let allowed_m = if padding > 0.0 { 2.0 * padding } else { 0.005 };
+            assert!(step_m <= allowed_m, "{edge}, {padding}: {step_m}");
+            assert!(checker.edge_collision(&from, &to, Contact::None).is_some(), "{edge}, {padding}");
+        }
+    }
+}
