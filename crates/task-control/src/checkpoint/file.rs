@@ -16,7 +16,7 @@ use std::path::Path;
 /// What every checkpoint file begins with.
 const MAGIC: &[u8; 16] = b"ratn checkpoint\n";
 /// Its format. Another one is not read.
-const FORMAT: u32 = 7;
+const FORMAT: u32 = 8;
 /// The bytes before the rest: what it is, its format, how long the rest is and its digest.
 const PREAMBLE: usize = MAGIC.len() + 4 + 8 + blake3::OUT_LEN;
 /// A run whose state is larger than this has no checkpoints.
