@@ -553,7 +553,8 @@ async fn a_forged_lease_neither_moves_the_arm_nor_keeps_its_next_holder_from_it(
         endpoint: system.cell.to_string(),
         superclasses: Vec::new(),
     };
-    let forged = |id: LeaseId, token: FencingToken| Lease { id, token, resources: vec![arm.clone()] };
+    let forged =
+        |id: LeaseId, token: FencingToken| Lease { id, token, resources: vec![arm.clone()], consumed: Vec::new() };
     let most = FencingToken(u64::MAX);
     for (what, lease) in [
         ("made up", forged(LeaseId(u64::MAX), most)),

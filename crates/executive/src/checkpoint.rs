@@ -5,7 +5,9 @@
 
 use ratn_model::condition::Condition;
 use ratn_model::id::{FencingToken, LeaseId};
-use ratn_model::resource::{Lease, LeasedResource, Quantity, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::resource::{
+    Lease, LeasedResource, OperatedUnits, Quantity, Requirement, ResourceClass, ResourceOperation,
+};
 use ratn_model::value::Value;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::collections::BTreeMap;
@@ -53,30 +55,35 @@ pub(crate) fn at<T: Clone>(all: &[T], place: u32, broken: Broken) -> Result<T, B
 }
 
 type ResourceForm = (String, String, String, Vec<String>);
-type LeaseForm = (LeaseId, FencingToken, Vec<ResourceForm>);
+type UnitsForm = (String, String, Quantity, bool);
+type LeaseForm = (LeaseId, FencingToken, Vec<ResourceForm>, Vec<UnitsForm>);
 
 /// Serialization of an optional lease.
 pub(crate) mod leases {
-    use super::{Deserialize, Deserializer, Lease, LeaseForm, LeasedResource, Serialize, Serializer};
+    use super::{Deserialize, Deserializer, Lease, LeaseForm, LeasedResource, OperatedUnits, Serialize, Serializer};
     use std::borrow::Borrow;
 
     pub(crate) fn serialize<L: Borrow<Lease>, S: Serializer>(lease: &Option<L>, to: S) -> Result<S::Ok, S::Error> {
         let form = |lease: &L| -> LeaseForm {
-            let Lease { id, token, resources } = lease.borrow().clone();
+            let Lease { id, token, resources, consumed } = lease.borrow().clone();
             let resource = |resource| {
                 let LeasedResource { id, kind, endpoint, superclasses } = resource;
                 (id, kind, endpoint, superclasses)
             };
-            (id, token, resources.into_iter().map(resource).collect())
+            let units = |one: OperatedUnits| (one.resource, one.kind, one.units, one.ends_with_session);
+            (id, token, resources.into_iter().map(resource).collect(), consumed.into_iter().map(units).collect())
         };
         lease.as_ref().map(form).serialize(to)
     }
 
     pub(crate) fn deserialize<'d, L: From<Lease>, D: Deserializer<'d>>(from: D) -> Result<Option<L>, D::Error> {
         let form = Option::<LeaseForm>::deserialize(from)?;
-        Ok(form.map(|(id, token, resources)| {
+        Ok(form.map(|(id, token, resources, consumed)| {
             let resource = |(id, kind, endpoint, superclasses)| LeasedResource { id, kind, endpoint, superclasses };
-            Lease { id, token, resources: resources.into_iter().map(resource).collect() }.into()
+            let units =
+                |(resource, kind, units, ends_with_session)| OperatedUnits { resource, kind, units, ends_with_session };
+            let (resources, consumed) = (resources.into_iter().map(resource), consumed.into_iter().map(units));
+            Lease { id, token, resources: resources.collect(), consumed: consumed.collect() }.into()
         }))
     }
 }

@@ -4,7 +4,7 @@ use crate::lookahead::Held;
 use ratn_model::fact::{Change, FactKey, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision, StateId};
 use ratn_model::measurement::Evidence;
-use ratn_model::resource::{Lease, Quantity, Requirement};
+use ratn_model::resource::{Lease, OperatedUnits, Quantity, Requirement};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
@@ -131,6 +131,13 @@ pub enum Event {
         operation: u64,
         /// Number of the session with these records; it is the run's session from now on.
         session: u64,
+        /// What that operation has created, deleted and used up, by its requirements. Nothing where the resource manager does not say all of it, or
+        /// where only more than one operation is told of.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        units: Vec<Vec<OperatedUnits>>,
+        /// What the run had created before is made anew in that session: the new ids by those of before.
+        #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+        renamed: BTreeMap<String, String>,
     },
     /// When task control came back, the session under which the run held its resources was gone. Logged; changes nothing.
     SessionLost {

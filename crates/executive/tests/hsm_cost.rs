@@ -59,7 +59,7 @@ fn goals(states: &str, n: i64) -> usize {
 }
 
 fn granted(instance: InstanceId) -> Event {
-    let lease = Lease { id: LeaseId(1), token: FencingToken(1), resources: Vec::new() };
+    let lease = Lease { id: LeaseId(1), token: FencingToken(1), resources: Vec::new(), consumed: Vec::new() };
     Event::Granted { instance, lease }
 }
 

@@ -136,6 +136,23 @@ pub struct Lease {
     pub token: crate::id::FencingToken,
     /// The resources, in the order of the requirements.
     pub resources: Vec<LeasedResource>,
+    /// What the grant has used up.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub consumed: Vec<OperatedUnits>,
+}
+
+/// Units of one resource that were created, deleted or used up.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OperatedUnits {
+    /// The resource's id.
+    pub resource: String,
+    /// Its kind, which may be below the one that was asked for.
+    pub kind: String,
+    /// How much of it.
+    pub units: Quantity,
+    /// Whether that is over with the session that it was done for: what was created vanishes, what was used up returns or vanishes, and what was
+    /// deleted would have vanished. Otherwise it stays so.
+    pub ends_with_session: bool,
 }
 
 /// A resource under a lease.

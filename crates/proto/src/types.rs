@@ -5,7 +5,7 @@ use ratn_model::condition::Condition;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
 use ratn_model::measurement::{Certainty, Evidence, Measurement};
-use ratn_model::resource::{Lease, Quantity, Requirement, ResourceClass};
+use ratn_model::resource::{Lease, OperatedUnits, Quantity, Requirement, ResourceClass};
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -291,6 +291,15 @@ pub struct Provision {
     pub most: u32,
     /// It starts more of it as well for requests that wait for what exists and is held.
     pub grows: bool,
+}
+
+/// What a request of before came to. Of one that an earlier version of the resource manager performed nothing is known but that.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Recalled {
+    /// The id of what it created.
+    pub created: Option<String>,
+    /// What it deleted or used up.
+    pub operated: Vec<OperatedUnits>,
 }
 
 /// What waits for more than exists, or has waited for long for what is held.

@@ -382,7 +382,9 @@ impl Pool {
             let units = if amount.is_whole() && !resource.description.divisible { amount.units() } else { 1 };
             resources.extend(std::iter::repeat_n(leased(resource), units as usize));
         }
-        Some(Lease { id, token: record.token, resources })
+        let consumed = record.consumed.iter();
+        let consumed = consumed.filter_map(|(slot, amount)| self.consumed_units(&record.session, *slot, *amount));
+        Some(Lease { id, token: record.token, resources, consumed: consumed.collect() })
     }
 
     /// Takes a waiter from everywhere; with the fingerprint of its request.

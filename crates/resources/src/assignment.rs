@@ -48,10 +48,30 @@ impl Assignment {
 
     /// The maximum assignment of what is available to the requirements.
     pub(crate) fn of(resources: &Resources, available: Available<'_>, requirements: &[&Requirement]) -> Assignment {
+        Assignment::among(resources, available, requirements, None)
+    }
+
+    /// The same for one requirement, of one resource alone.
+    pub(crate) fn of_one(
+        resources: &Resources,
+        available: Available<'_>,
+        requirement: &Requirement,
+        resource: Slot,
+    ) -> Assignment {
+        Assignment::among(resources, available, &[requirement], Some(resource))
+    }
+
+    fn among(
+        resources: &Resources,
+        available: Available<'_>,
+        requirements: &[&Requirement],
+        alone: Option<Slot>,
+    ) -> Assignment {
         let looked_at = Cell::new(0);
         let mut search = Search {
             resources,
             available,
+            alone,
             classes: classes(requirements),
             taken: vec![Units::new(); requirements.len()],
             missing: vec![Quantity::ZERO; requirements.len()],
@@ -81,6 +101,8 @@ struct Class<'a> {
 struct Search<'a> {
     resources: &'a Resources,
     available: Available<'a>,
+    /// Nothing but this resource.
+    alone: Option<Slot>,
     classes: Vec<Class<'a>>,
     taken: Vec<Units>,
     missing: Vec<Quantity>,
@@ -205,6 +227,10 @@ impl<'a> Search<'a> {
     fn candidates(&self, class: &Class<'a>) -> Candidates<'a> {
         let kind = &class.selector.kind;
         let of_kind: Candidates<'a> = match self.available {
+            _ if let Some(slot) = self.alone => {
+                let is_of_kind = |one: &&Resource| self.resources.kinds().is_a(&one.description.kind, kind);
+                Box::new(self.resources.get(slot).filter(is_of_kind).map(|one| (slot, one)).into_iter())
+            }
             Available::Existing => Box::new(self.resources.all_of(kind)),
             Available::Free(_) | Available::FreeTo(..) => Box::new(self.resources.free_of(kind)),
         };

@@ -2,11 +2,11 @@
 
 use crate::assignment::{Assignment, Available};
 use crate::error::PoolError;
-use crate::id::SessionId;
+use crate::id::{SessionId, Slot};
 use crate::pool::Pool;
 use crate::record::Effect;
 use crate::resource::Units;
-use ratn_model::resource::{Requirement, ResourceOperation};
+use ratn_model::resource::{OperatedUnits, Quantity, Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 
 /// Resources of which something returns in one turn.
@@ -24,20 +24,61 @@ impl Pool {
         session: &SessionId,
         requirement: &Requirement,
     ) -> Result<Vec<String>, PoolError> {
+        let consumed = self.consume_units(now, session, requirement, None)?;
+        Ok(consumed.into_iter().map(|one| one.resource).collect())
+    }
+
+    /// As [`Pool::consume`], of one resource alone.
+    ///
+    /// # Errors
+    /// As there, and an unknown resource.
+    pub fn consume_of(
+        &mut self,
+        now: Timestamp,
+        session: &SessionId,
+        requirement: &Requirement,
+        resource: &str,
+    ) -> Result<Vec<OperatedUnits>, PoolError> {
+        self.consume_units(now, session, requirement, Some(resource))
+    }
+
+    pub(crate) fn consume_units(
+        &mut self,
+        now: Timestamp,
+        session: &SessionId,
+        requirement: &Requirement,
+        resource: Option<&str>,
+    ) -> Result<Vec<OperatedUnits>, PoolError> {
         self.begin(now);
         self.session(session)?;
         self.check_requirements(std::slice::from_ref(requirement), &[ResourceOperation::Consume])?;
-        let assignment = Assignment::of(&self.resources, Available::Free(&self.queue.reserved), &[requirement]);
+        let available = Available::Free(&self.queue.reserved);
+        let assignment = match resource {
+            None => Assignment::of(&self.resources, available, &[requirement]),
+            Some(id) => {
+                let unknown = || PoolError::UnknownResource { id: id.to_owned() };
+                let slot = self.resources.find(id).ok_or_else(unknown)?;
+                Assignment::of_one(&self.resources, available, requirement, slot)
+            }
+        };
         if !assignment.is_complete() {
             let missing = assignment.missing.into_iter().sum();
             let found = requirement.count.saturating_sub(missing);
             return Err(PoolError::NotEnough { wanted: requirement.to_string(), found });
         }
         let taken: Units = assignment.taken.into_iter().flatten().collect();
-        let ids = taken.keys().filter_map(|slot| self.id_of(*slot)).collect();
+        let consumed = taken.iter().filter_map(|(slot, amount)| self.consumed_units(session, *slot, *amount)).collect();
         self.commit_consumed(session, taken);
         self.schedule();
-        Ok(ids)
+        Ok(consumed)
+    }
+
+    /// So much of a resource as a session has used it up: it returns with the session where it is renewable, and goes with it where it is its own.
+    pub(crate) fn consumed_units(&self, session: &SessionId, slot: Slot, units: Quantity) -> Option<OperatedUnits> {
+        let known = self.resources.get(slot)?;
+        let ends_with_session = known.description.renewable || known.owner.as_ref() == Some(session);
+        let (resource, kind) = (known.description.id.clone(), known.description.kind.clone());
+        Some(OperatedUnits { resource, kind, units, ends_with_session })
     }
 
     /// The session's task is over: what it consumed of renewable resources returns. Where it is of many, some of it returns: as long as

@@ -9,7 +9,7 @@ use crate::record::Effect;
 use crate::resource::{Description, LONGEST_STANDSTILL_MS, Resource, ResourceSpec, ResourceView, STANDSTILL_ATTRIBUTE};
 use crate::session::Session;
 use ratn_model::id::LeaseId;
-use ratn_model::resource::{Quantity, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::resource::{OperatedUnits, Quantity, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use std::sync::Arc;
@@ -119,16 +119,17 @@ impl Pool {
         session: &SessionId,
         requirement: &Requirement,
     ) -> Result<Vec<String>, PoolError> {
-        self.take_units(now, session, requirement).map(|(touched, _)| touched)
+        let deleted = self.take_units(now, session, requirement)?;
+        Ok(deleted.into_iter().map(|one| one.resource).collect())
     }
 
-    /// The same, and of each whether it was the session's own.
+    /// The same, with the amounts.
     pub(crate) fn take_units(
         &mut self,
         now: Timestamp,
         session: &SessionId,
         requirement: &Requirement,
-    ) -> Result<(Vec<String>, Vec<bool>), PoolError> {
+    ) -> Result<Vec<OperatedUnits>, PoolError> {
         self.begin(now);
         self.session(session)?;
         self.check_requirements(std::slice::from_ref(requirement), &[ResourceOperation::Delete])?;
@@ -153,19 +154,23 @@ impl Pool {
         if found < wanted {
             return Err(of_others.unwrap_or(PoolError::NotEnough { wanted: requirement.to_string(), found }));
         }
-        let (mut touched, mut own) = (Vec::new(), Vec::new());
+        let mut deleted = Vec::new();
         for (slot, free) in free {
             let amount = free.min(wanted);
             if amount.is_zero() {
                 continue;
             }
             wanted = wanted.saturating_sub(amount);
-            touched.extend(self.id_of(slot));
-            own.extend(self.resources.get(slot).map(|one| one.owner.as_ref() == Some(session)));
+            deleted.extend(self.resources.get(slot).map(|one| OperatedUnits {
+                resource: one.description.id.clone(),
+                kind: one.description.kind.clone(),
+                units: amount,
+                ends_with_session: one.owner.as_ref() == Some(session),
+            }));
             self.shrink(slot, amount);
         }
         self.schedule();
-        Ok((touched, own))
+        Ok(deleted)
     }
 
     fn shrink(&mut self, slot: Slot, amount: Quantity) {

@@ -128,7 +128,7 @@ mod tests {
         let mut spec = ResourceSpec::new(ResourceClass::Module, "Arm");
         spec.attributes = [("reach_m".to_owned(), Value::Float(0.82)), ("left".to_owned(), Value::Null)].into();
         let release = Request::Release { session: None, lease: LeaseId(7) };
-        let consume = Request::Consume { session: session(), requirement: requirement() };
+        let consume = Request::Consume { session: session(), requirement: requirement(), resource: None };
         let requests = [
             Request::Create { session: Some(session()), spec },
             Request::Delete { session: None, id: "arm@sim".to_owned() },

@@ -13,6 +13,7 @@ use crate::fingerprint::Fingerprint;
 use crate::id::WaiterId;
 use crate::limits::Limits;
 use ratn_model::id::{LeaseId, Revision};
+use ratn_model::resource::OperatedUnits;
 use ratn_model::time::Timestamp;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -43,6 +44,8 @@ pub(crate) enum Remembered {
     Done,
     /// As [`Remembered::Touched`], where some of it ends with the life and some does not.
     InPart(Vec<String>),
+    /// What was deleted or used up. In answers of before it is one of the two above, without the amounts.
+    Operated(Vec<OperatedUnits>),
 }
 
 /// What ends with the session that a request was done for, of what the request did.
@@ -114,6 +117,11 @@ impl Ends {
             (false, _) => Ends::Nothing,
         }
     }
+
+    /// The same of what was deleted or used up.
+    pub(crate) fn of_units(each: &[OperatedUnits]) -> Ends {
+        Ends::of(&each.iter().map(|one| one.ends_with_session).collect::<Vec<_>>())
+    }
 }
 
 impl Remembered {
@@ -123,7 +131,19 @@ impl Remembered {
             Remembered::Touched(ids) | Remembered::InPart(ids) => {
                 ids.iter().map(|id| id.len() + size_of::<String>()).sum()
             }
+            Remembered::Operated(all) => {
+                all.iter().map(|one| one.resource.len() + one.kind.len() + size_of::<OperatedUnits>()).sum()
+            }
             Remembered::Granted(_) | Remembered::Done => 0,
+        }
+    }
+
+    /// Whether some of it ends with the life that it was done for and some does not.
+    fn ends_in_part(&self) -> bool {
+        match self {
+            Remembered::InPart(_) => true,
+            Remembered::Operated(all) => Ends::of_units(all) == Ends::Part,
+            _ => false,
         }
     }
 }
@@ -167,7 +187,7 @@ impl RequestMemory {
         if let Some((print, waiter)) = self.waiting.get(id) {
             return same(id, *print, fingerprint).map(|()| Some(Recalled::Waiting(*waiter)));
         }
-        let counts = |answer: &&Answer| !is_over(answer.life) || matches!(answer.reply, Remembered::InPart(_));
+        let counts = |answer: &&Answer| !is_over(answer.life) || answer.reply.ends_in_part();
         let own = self.answer(id).filter(counts);
         own.map_or(Ok(()), |answer| same(id, answer.fingerprint, fingerprint))?;
         let unknown = || self.unknown(id).filter(counts).filter(|answer| answer.fingerprint.may_be(fingerprint));
@@ -183,6 +203,11 @@ impl RequestMemory {
         let counts = |answer: &&Answer| !is_over(answer.life);
         let answer = || self.answer(id).filter(counts).or_else(|| self.unknown(id).filter(counts));
         waiting.or_else(|| answer().map(|answer| Recalled::Answered(answer.reply.clone())))
+    }
+
+    /// What a request was answered, also where that ended with a life that is over.
+    pub(crate) fn answered(&self, id: &RequestId) -> Option<&Remembered> {
+        self.answer(id).or_else(|| self.unknown(id)).map(|answer| &answer.reply)
     }
 
     /// Who waits under this id: the caller's own waiter, else that of the first caller who has one.

@@ -176,9 +176,7 @@ impl Pool {
                 }
                 self.lease(lease).map(Reply::Granted).ok_or(PoolError::UnknownLease { lease })
             }
-            Some(Recalled::Answered(Remembered::Created { id, revision })) => Ok(Reply::Created { id, revision }),
-            Some(Recalled::Answered(Remembered::Touched(ids) | Remembered::InPart(ids))) => Ok(Reply::Touched(ids)),
-            Some(Recalled::Answered(Remembered::Done)) => Ok(Reply::Done),
+            Some(Recalled::Answered(answered)) => Ok(replied(answered)),
             None if let Request::Acquire(acquire) = &request
                 && self.withdrawals.is_withdrawn(&id, &acquire.session) =>
             {
@@ -197,7 +195,7 @@ impl Pool {
                     // By its last part.
                     Reply::Unfinished => return Ok(reply),
                     Reply::Created { id, revision } => Remembered::Created { id: id.clone(), revision: *revision },
-                    Reply::Touched(ids) if ends == Ends::Part => Remembered::InPart(ids.clone()),
+                    Reply::Operated(units) => Remembered::Operated(units.clone()),
                     Reply::Touched(ids) => Remembered::Touched(ids.clone()),
                     Reply::Done => Remembered::Done,
                 };
@@ -205,6 +203,24 @@ impl Pool {
                 Ok(reply)
             }
         }
+    }
+
+    /// What a request for a session was answered, also where that ended with an earlier session of the same id; nothing where it was never performed,
+    /// or that is forgotten: of one caller the oldest answers are forgotten first, so where an older one is known it was not. Of an acquire that was
+    /// granted it is [`Reply::Done`].
+    ///
+    /// # Errors
+    /// A session that another opened.
+    pub fn recall(
+        &mut self,
+        now: Timestamp,
+        speaker: &Speaker,
+        session: &SessionId,
+        request_id: &str,
+    ) -> Result<Option<Reply>, PoolError> {
+        self.check_speaker(now, speaker, session)?;
+        let id = RequestId::new(self.caller_of(Some(session), speaker), request_id);
+        Ok(self.memory.answered(&id).cloned().map(replied))
     }
 
     /// Who is answered: the opener of the session, where that is there.
@@ -360,15 +376,14 @@ impl Pool {
                 (Reply::Done, Ends::of(&[is_own]))
             }
             Request::DeleteUnits { session, requirement } => {
-                let (touched, own) = self.take_units(now, &session, &requirement)?;
-                (Reply::Touched(touched), Ends::of(&own))
+                let deleted = self.take_units(now, &session, &requirement)?;
+                let ends = Ends::of_units(&deleted);
+                (Reply::Operated(deleted), ends)
             }
-            Request::Consume { session, requirement } => {
-                let touched = self.consume(now, &session, &requirement)?;
-                let resources = touched.iter().filter_map(|id| self.resources.get(self.resources.find(id)?));
-                let ends = |one: &Resource| one.description.renewable || one.owner.as_ref() == Some(&session);
-                let ends: Vec<bool> = resources.map(ends).collect();
-                (Reply::Touched(touched), Ends::of(&ends))
+            Request::Consume { session, requirement, resource } => {
+                let consumed = self.consume_units(now, &session, &requirement, resource.as_deref())?;
+                let ends = Ends::of_units(&consumed);
+                (Reply::Operated(consumed), ends)
             }
             Request::Acquire(request) => (Reply::Queued(self.enqueue(request, id, print)?), Ends::Nothing),
             Request::Release { session, lease } => {
@@ -384,5 +399,15 @@ impl Pool {
                 (reply, Ends::All)
             }
         })
+    }
+}
+
+/// As it is told. Whoever asks for a grant once more is told of its lease elsewhere.
+fn replied(answered: Remembered) -> Reply {
+    match answered {
+        Remembered::Created { id, revision } => Reply::Created { id, revision },
+        Remembered::Operated(units) => Reply::Operated(units),
+        Remembered::Touched(ids) | Remembered::InPart(ids) => Reply::Touched(ids),
+        Remembered::Granted(_) | Remembered::Done => Reply::Done,
     }
 }

@@ -20,7 +20,7 @@ use std::time::Duration;
 
 /// The version that [`encode`] writes, its first byte. Every new variant at the end takes a new number, so that an older program
 /// refuses what it does not know by its version; records since [`OLDEST_FORMAT`] are read as they are.
-pub const FORMAT: u8 = 11;
+pub const FORMAT: u8 = 12;
 /// The oldest version that [`decode`] reads: it has no `Effect::SessionOpened`, as none before this one has `Effect::UnitsFreed`.
 pub const OLDEST_FORMAT: u8 = 2;
 /// The newest version whose fingerprints are of how requests were written then, which says nothing to a later one.

@@ -4,7 +4,7 @@ use crate::id::{SessionId, WaiterId};
 use crate::queue::AcquireRequest;
 use crate::resource::ResourceSpec;
 use ratn_model::id::{LeaseId, Revision};
-use ratn_model::resource::{Lease, Requirement};
+use ratn_model::resource::{Lease, OperatedUnits, Requirement};
 use serde::{Deserialize, Serialize};
 
 /// A mutation of the pool; each does what the method of the same name on [`crate::Pool`] does.
@@ -31,12 +31,14 @@ pub enum Request {
         /// What.
         requirement: Requirement,
     },
-    /// See [`crate::Pool::consume`].
+    /// See [`crate::Pool::consume`] and [`crate::Pool::consume_of`].
     Consume {
         /// Who asks.
         session: SessionId,
         /// What.
         requirement: Requirement,
+        /// Of this resource alone.
+        resource: Option<String>,
     },
     /// See [`crate::Pool::acquire`].
     Acquire(AcquireRequest),
@@ -94,8 +96,10 @@ pub enum Reply {
     Queued(WaiterId),
     /// To an acquire repeated after it was granted.
     Granted(Lease),
-    /// To a consume or a delete of units: the ids of the resources touched. To a confirmation of standstill: the resource, if units
-    /// of it became free by it.
+    /// To a consume or a delete of units: what of which resources.
+    Operated(Vec<OperatedUnits>),
+    /// To a confirmation of standstill: the resource, if units of it became free by it. To a consume or a delete of units that an earlier version
+    /// performed: the ids of the resources.
     Touched(Vec<String>),
     /// To the end of a task with much to return: some of it has. The same request once more goes on with it.
     Unfinished,

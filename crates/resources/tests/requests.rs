@@ -1,7 +1,7 @@
 //! Requests that are repeated: which answers are remembered, for whom, and for how many requests of others.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
-use ratn_model::resource::{Quantity, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::resource::{OperatedUnits, Quantity, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_resources::{
     AcquireRequest, Limits, Pool, PoolError, Reply, Request, ResourceSpec, SessionId, Snapshot, Speaker, decode, encode,
@@ -184,9 +184,15 @@ fn what_ended_with_an_earlier_life_of_a_session_is_done_anew_for_the_next_one() 
             pool.create(NOW, None, ResourceSpec::new(ResourceClass::Module, kind)).unwrap();
         }
         let requirement = Requirement::new(ResourceOperation::Consume, "Power");
-        let consume = Request::Consume { session: SessionId::from("adam"), requirement: requirement.clone() };
+        let consume =
+            Request::Consume { session: SessionId::from("adam"), requirement: requirement.clone(), resource: None };
         let ask = |pool: &mut Pool, id: &str, request: Request| pool.handle_as(NOW, &speaker("adam"), id, request);
-        let touched = Ok(Reply::Touched(vec![powered.clone()]));
+        let touched = Ok(Reply::Operated(vec![OperatedUnits {
+            resource: powered.clone(),
+            kind: "Power".to_owned(),
+            units: Quantity::ONE,
+            ends_with_session: true,
+        }]));
         assert_eq!(ask(&mut pool, "consume", consume.clone()), touched);
         assert_eq!(ask(&mut pool, "consume", consume.clone()), touched, "once: there is one of it");
         let tool = created(&mut pool, "adam", "create");
@@ -224,7 +230,8 @@ fn what_outlasts_a_session_is_done_once_for_all_its_lives() {
         }
         let of = |operation| Requirement::new(operation, "Screw");
         let session = SessionId::from("adam");
-        let consume = Request::Consume { session: session.clone(), requirement: of(ResourceOperation::Consume) };
+        let consume =
+            Request::Consume { session: session.clone(), requirement: of(ResourceOperation::Consume), resource: None };
         let delete = Request::DeleteUnits { session, requirement: of(ResourceOperation::Delete) };
         let ask = |pool: &mut Pool, id: &str, request| pool.handle_as(NOW, &speaker("adam"), id, request).unwrap();
         let first = (ask(&mut pool, "c", consume.clone()), ask(&mut pool, "d", delete.clone()));
@@ -264,7 +271,9 @@ fn what_ended_with_an_earlier_life_is_done_anew_also_for_whom_nobody_knows() {
 fn two(operation: ResourceOperation, kind: &str) -> Request {
     let requirement = Requirement { count: Quantity::whole(2), ..Requirement::new(operation, kind) };
     match operation {
-        ResourceOperation::Consume => Request::Consume { session: SessionId::from("adam"), requirement },
+        ResourceOperation::Consume => {
+            Request::Consume { session: SessionId::from("adam"), requirement, resource: None }
+        }
         _ => Request::DeleteUnits { session: SessionId::from("adam"), requirement },
     }
 }
@@ -311,4 +320,72 @@ fn what_ended_in_part_with_an_earlier_life_is_refused_and_not_done_twice() {
             assert_eq!(there, Quantity::whole(2), "{kind} {restart:?}");
         }
     }
+}
+
+#[test]
+fn what_a_request_came_to_is_told_also_when_its_session_has_ended() {
+    let units = |resource: &str, kind: &str, units: u32, ends_with_session: bool| OperatedUnits {
+        resource: resource.to_owned(),
+        kind: kind.to_owned(),
+        units: units.into(),
+        ends_with_session,
+    };
+    for restart in [None, Some(false), Some(true)] {
+        let mut pool = pool_of(Limits::default(), &["adam", "eve"]);
+        let glue = ResourceSpec::new(ResourceClass::Module, "Glue").non_renewable().capacity(3);
+        let glue = pool.create(NOW, None, glue).unwrap().description.id.clone();
+        pool.create(NOW, None, ResourceSpec::new(ResourceClass::Module, "Tool").id("other")).unwrap();
+        let tool = created(&mut pool, "adam", "create");
+        let requests = [("d", two(ResourceOperation::Delete, "Tool")), ("u", two(ResourceOperation::Consume, "Glue"))];
+        for (id, request) in requests {
+            pool.handle_as(NOW, &speaker("adam"), id, request).unwrap();
+        }
+        let mut pool = reopened(pool, &Limits::default(), restart);
+        let mut told =
+            |caller: &str, id: &str| pool.recall(NOW, &speaker(caller), &SessionId::from(caller), id).unwrap();
+        assert!(matches!(told("adam", "create"), Some(Reply::Created { id, .. }) if id == tool));
+        let deleted = vec![units(&tool, "Tool", 1, true), units("other", "Tool", 1, false)];
+        assert_eq!(told("adam", "d"), Some(Reply::Operated(deleted)), "{restart:?}");
+        assert_eq!(told("adam", "u"), Some(Reply::Operated(vec![units(&glue, "Glue", 2, false)])));
+        assert_eq!(told("adam", "never asked"), None);
+        assert_eq!(told("eve", "d"), None, "it is another caller's");
+        let others = pool.recall(NOW, &speaker("eve"), &SessionId::from("adam"), "d");
+        assert!(matches!(others, Err(PoolError::SessionOfAnother { .. })), "{others:?}");
+    }
+}
+
+#[test]
+fn of_one_resource_alone_is_used_up_what_is_there_of_it() {
+    let mut pool = pool_of(Limits::default(), &["adam"]);
+    for id in ["one", "two"] {
+        pool.create(NOW, None, ResourceSpec::new(ResourceClass::Module, "Power").id(id)).unwrap();
+    }
+    let mut consume = |id: &str, kind: &str, resource: &str| {
+        let (session, resource) = (SessionId::from("adam"), Some(resource.to_owned()));
+        let requirement = Requirement::new(ResourceOperation::Consume, kind);
+        pool.handle_as(NOW, &speaker("adam"), id, Request::Consume { session, requirement, resource })
+    };
+    assert!(matches!(consume("a", "Power", "two"), Ok(Reply::Operated(of)) if of[0].resource == "two"));
+    assert!(matches!(consume("b", "Power", "two"), Err(PoolError::NotEnough { .. })), "of the other one there is");
+    assert!(matches!(consume("c", "Glue", "one"), Err(PoolError::NotEnough { .. })), "it is of another kind");
+    assert!(matches!(consume("d", "Power", "three"), Err(PoolError::UnknownResource { .. })));
+    assert!(matches!(consume("a", "Power", "one"), Err(PoolError::RequestIdReused { .. })), "it is another request");
+}
+
+#[test]
+fn what_a_grant_uses_up_is_told_with_its_lease() {
+    let mut pool = pool_of(Limits::default(), &["adam"]);
+    pool.create(NOW, None, ResourceSpec::new(ResourceClass::Module, "Arm")).unwrap();
+    pool.create(NOW, None, ResourceSpec::new(ResourceClass::Module, "Glue").id("glue").capacity(3)).unwrap();
+    let requirements = ["Arm", "Glue"].map(|kind| {
+        let operation = if kind == "Arm" { ResourceOperation::Block } else { ResourceOperation::Consume };
+        Requirement::new(operation, kind)
+    });
+    let acquire = Request::Acquire(AcquireRequest::new(SessionId::from("adam"), requirements.to_vec()));
+    let mut ask = || pool.handle_as(NOW, &speaker("adam"), "a", acquire.clone());
+    let Ok(Reply::Queued(_)) = ask() else { panic!() };
+    let Ok(Reply::Granted(lease)) = ask() else { panic!() };
+    let [consumed] = &lease.consumed[..] else { panic!("{lease:?}") };
+    assert_eq!((&*consumed.resource, consumed.units, consumed.ends_with_session), ("glue", Quantity::ONE, true));
+    assert_eq!(lease.resources.len(), 1);
 }

@@ -101,6 +101,7 @@ fn perform(pool: &mut Pool, now: u64, step: &Step, id: u8) -> String {
         Step::Consume { session: index, kind, count } => Request::Consume {
             session: session(*index),
             requirement: requirement(ResourceOperation::Consume, *kind, *count),
+            resource: None,
         },
         Step::Acquire { session: index, kinds, hold_for, consume } => {
             let operation = if *consume { ResourceOperation::Consume } else { ResourceOperation::Block };
@@ -301,6 +302,21 @@ fn bytes_of_another_version_or_cut_short_are_refused() {
 /// A snapshot without the list of lives at its end, which versions up to 10 do not have.
 fn without_lives(bytes: &[u8], lives: &[u8]) -> Vec<u8> {
     bytes.strip_suffix(lives).unwrap().to_vec()
+}
+
+#[test]
+fn what_the_version_before_deleted_or_used_up_is_told_without_amounts() {
+    let (now, id) = (Timestamp(0), SessionId::from("s"));
+    let speaker = Speaker { name: "a".into(), for_anybody: false };
+    // The answer `Touched` to a caller `a`, under the request id `r`, for a resource `x`.
+    let records = decode(&[11, 1, 13, 1, b'a', 1, b'r', 0, 2, 1, 1, b'x', 0]).unwrap();
+    let mut pool = Pool::restore(Limits::default(), now, None, records).unwrap();
+    pool.keep_alive_as(now, &speaker, &id, "s", Duration::from_secs(10)).unwrap();
+    let touched = ratn_resources::Reply::Touched(vec!["x".to_owned()]);
+    assert_eq!(pool.recall(now, &speaker, &id, "r"), Ok(Some(touched.clone())));
+    let requirement = requirement(ResourceOperation::Delete, 0, 1);
+    let repeated = pool.handle_as(now, &speaker, "r", Request::DeleteUnits { session: id, requirement });
+    assert_eq!(repeated, Ok(touched), "it is not done again");
 }
 
 #[test]

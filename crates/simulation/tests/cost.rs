@@ -125,7 +125,12 @@ impl Shell {
         match command {
             Command::Acquire { instance, .. } => {
                 self.number += 1;
-                let lease = Lease { id: LeaseId(self.number), token: FencingToken(1), resources: Vec::new() };
+                let lease = Lease {
+                    id: LeaseId(self.number),
+                    token: FencingToken(1),
+                    resources: Vec::new(),
+                    consumed: Vec::new(),
+                };
                 self.events.push_back(Event::Granted { instance, lease });
             }
             Command::Withdraw { instance } => {

@@ -69,7 +69,8 @@ impl Begun {
 
     fn grant(&mut self, at_s: u64, path: &str) {
         let instance = self.instance(path);
-        let lease = Lease { id: LeaseId(instance.0), token: FencingToken(1), resources: Vec::new() };
+        let lease =
+            Lease { id: LeaseId(instance.0), token: FencingToken(1), resources: Vec::new(), consumed: Vec::new() };
         self.handle(at_s, Event::Granted { instance, lease });
     }
 

@@ -266,7 +266,8 @@ fn a_routine_that_asks_anew_comes_before_who_only_improves() {
                         superclasses: Vec::new(),
                     };
                     let resources = requirements.into_iter().map(|wanted| resource(wanted.kind)).collect();
-                    let lease = Lease { id: LeaseId(leases), token: FencingToken(leases), resources };
+                    let lease =
+                        Lease { id: LeaseId(leases), token: FencingToken(leases), resources, consumed: Vec::new() };
                     events.push_back(Event::Granted { instance, lease });
                 }
                 Command::Start { instance, attempt, goal } if goal.improves.is_some() => {

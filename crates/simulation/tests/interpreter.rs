@@ -224,7 +224,8 @@ impl Bench {
     }
 
     fn grant(&mut self, instance: u64, lease: u64) {
-        let lease = Lease { id: LeaseId(lease), token: FencingToken(lease), resources: Vec::new() };
+        let lease =
+            Lease { id: LeaseId(lease), token: FencingToken(lease), resources: Vec::new(), consumed: Vec::new() };
         self.tell(Event::Granted { instance: InstanceId(instance), lease });
     }
 
@@ -232,7 +233,8 @@ impl Bench {
     fn grant_brain(&mut self, instance: u64, lease: u64) {
         let (endpoint, superclasses) = Default::default();
         let brain = LeasedResource { id: "Brain-1".to_owned(), kind: "Brain".to_owned(), endpoint, superclasses };
-        let lease = Lease { id: LeaseId(lease), token: FencingToken(lease), resources: vec![brain] };
+        let lease =
+            Lease { id: LeaseId(lease), token: FencingToken(lease), resources: vec![brain], consumed: Vec::new() };
         self.tell(Event::Granted { instance: InstanceId(instance), lease });
     }
 

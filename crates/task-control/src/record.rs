@@ -3,7 +3,7 @@
 //! asked for while that is on its way.
 
 use super::decided::{Unanswered, Undone, insist};
-use super::ledger::{Began, Confirmed, Projecting, operation_request};
+use super::ledger::{Began, Confirmed, Projecting, created, operation_request};
 use super::performer::{Answer, Untouched};
 use super::promises::{Made, Promises};
 use super::safe_on_disk::Mark;
@@ -12,7 +12,7 @@ use ratn_executive::protocol::{Event, Unmade};
 use ratn_model::fact::Change;
 use ratn_model::id::{InstanceId, ProjectionId, Revision};
 use ratn_model::measurement::Evidence;
-use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
+use ratn_model::resource::{OperatedUnits, Requirement, ResourceClass, ResourceOperation};
 use ratn_otlp::ids;
 use ratn_proto::types::Resource;
 use ratn_worker::client::retry_unanswered;
@@ -20,7 +20,7 @@ use ratn_worker::client::{CallError, Commit, Early, Projection, ResourceClient, 
 use ratn_worker::session::Trust;
 use ratn_worker::trace::{self, TraceContext};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::pin::pin;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -240,10 +240,10 @@ impl Recorder {
                 }
                 Record::Operate { instance, number, operations, order } => {
                     let operating = self.operate(instance, number, operations, &order);
-                    let failed = trace::within(self.of(instance), operating).await;
+                    let operated = trace::within(self.of(instance), operating).await;
                     behind = Some(order);
                     // Whoever resumes the run does not do it again.
-                    Some(failed.unwrap_or(Event::Recorded { operation: number, session: self.session }))
+                    Some(operated.unwrap_or_else(|failed| failed))
                 }
                 Record::Failed(reason) => {
                     recorded = recorded.and(Err(reason));
@@ -330,23 +330,28 @@ impl Recorder {
         number: u64,
         operations: Vec<Requirement>,
         order: &Order,
-    ) -> Option<Event> {
+    ) -> Result<Event, Event> {
         if let Some(refused) = unsafe_on_disk(instance, order.safe.clone()).await {
-            return Some(refused);
+            return Err(refused);
         }
         for lease in &order.after {
             lease.cancelled().await;
         }
+        let mut units = Vec::with_capacity(operations.len());
         for (index, operation) in operations.into_iter().enumerate() {
             let request = operation_request(&self.run, instance, number, index);
-            if let Err(undone) = operate_once(&self.resources, &self.trust, &request, &operation).await {
-                let reason = format!("`{operation}` was not done: {undone}");
-                // With the session lost it was not refused, and may be done by whoever resumes the run.
-                let unmade = if matches!(undone, Undone::Lost) { Unmade::Untried } else { Unmade::Operation(number) };
-                return Some(Event::RetirementFailed { instance, reason, unmade });
+            match operate_once(&self.resources, &self.trust, &request, &operation).await {
+                Ok(done) => units.push(done),
+                Err(undone) => {
+                    let reason = format!("`{operation}` was not done: {undone}");
+                    // With the session lost it was not refused, and may be done by whoever resumes the run.
+                    let lost = matches!(undone, Undone::Lost);
+                    let unmade = if lost { Unmade::Untried } else { Unmade::Operation(number) };
+                    return Err(Event::RetirementFailed { instance, reason, unmade });
+                }
             }
         }
-        None
+        Ok(recorded(number, self.session, units))
     }
 }
 
@@ -486,26 +491,32 @@ pub(super) async fn commit_next(
     }
 }
 
+/// An operation is done, in the session of this number, and has come to these units, if all of that is known.
+pub(super) fn recorded(operation: u64, session: u64, units: Vec<Option<Vec<OperatedUnits>>>) -> Event {
+    let units = units.into_iter().collect::<Option<Vec<_>>>().unwrap_or_default();
+    Event::Recorded { operation, session, units, renamed: BTreeMap::new() }
+}
+
 /// Creates, deletes or consumes, once however often it is asked for under this request id; a resource manager that is away is waited for as long as
-/// the run's session may live.
+/// the run's session may live. What it has come to, if the manager says that.
 pub(super) async fn operate_once(
     resources: &ResourceClient,
     trust: &Trust,
     request: &str,
     operation: &Requirement,
-) -> Result<(), Undone> {
+) -> Result<Option<Vec<OperatedUnits>>, Undone> {
     let ask = async || match operation.operation {
         ResourceOperation::Create => {
             let class = operation.class.unwrap_or(ResourceClass::Task);
             let mut resource = Resource::new("", class, operation.kind.clone()).with_capacity(operation.count);
             resource.divisible = operation.divisible;
             resource.attributes = operation.attributes.clone();
-            resources.create_once(request, resource).await.map(|_| ())
+            resources.create_once(request, resource).await.map(|made| Some(vec![created(operation, &made.id)]))
         }
-        ResourceOperation::Delete => resources.delete_matching_once(request, operation.clone()).await.map(|_| ()),
-        ResourceOperation::Consume => resources.consume_once(request, operation.clone()).await.map(|_| ()),
+        ResourceOperation::Delete => resources.delete_units_once(request, operation.clone()).await,
+        ResourceOperation::Consume => resources.consume_units_once(request, operation.clone(), "").await,
         // The executive gives these to an acquire.
-        ResourceOperation::Block | ResourceOperation::Exists => Ok(()),
+        ResourceOperation::Block | ResourceOperation::Exists => Ok(Some(Vec::new())),
     };
     insist(trust, Unanswered::Waits, ask).await
 }

@@ -134,7 +134,7 @@ fn lease(id: u64, resource: &str) -> Lease {
         endpoint: String::new(),
         superclasses: Vec::new(),
     };
-    Lease { id: LeaseId(id), token: FencingToken(id), resources: vec![resource] }
+    Lease { id: LeaseId(id), token: FencingToken(id), resources: vec![resource], consumed: Vec::new() }
 }
 
 fn goal(id: &str, action: &str, lease_id: u64, resource: &str) -> Goal {

@@ -100,7 +100,12 @@ impl System {
             action: "plan".to_owned(),
             inputs: goal_inputs,
             seed: 3,
-            lease: Some(Lease { id: LeaseId(1), token: FencingToken(1), resources: vec![resource] }),
+            lease: Some(Lease {
+                id: LeaseId(1),
+                token: FencingToken(1),
+                resources: vec![resource],
+                consumed: Vec::new(),
+            }),
             world_pool: self.world_pool.to_string(),
             ..Goal::default()
         }

@@ -30,7 +30,13 @@ pub(crate) async fn serve() {
 
 fn granted(request: &BlockRequest) -> BlockResponse {
     BlockResponse {
-        lease: Some(Lease { id: request.deadline_ms, token: 1, resources: Vec::new(), session_id: String::new() }),
+        lease: Some(Lease {
+            id: request.deadline_ms,
+            token: 1,
+            resources: Vec::new(),
+            session_id: String::new(),
+            consumed: Vec::new(),
+        }),
     }
 }
 

@@ -318,8 +318,8 @@ impl Client {
         let (answer, lost) = known(|| {
             let (patience, mut rpc) = (self.patience(), self.any());
             let requirement = Some(requirement.clone());
-            let question =
-                v1::ConsumeRequest { request_id: request_id.clone(), session_id: session(self.number), requirement };
+            let (request_id, session_id) = (request_id.clone(), session(self.number));
+            let question = v1::ConsumeRequest { request_id, session_id, requirement, resource_id: String::new() };
             async move { once(patience, rpc.consume(question)).await }
         })
         .await;
@@ -447,7 +447,7 @@ impl Client {
             v1::LeasedResource { id: provider::TOOL.to_owned(), kind: provider::KIND.to_owned(), ..Default::default() };
         let session_id = [String::new(), session(self.number)][self.random.below(2) as usize].clone();
         self.record.count("leases made up");
-        self.give_goal(&v1::Lease { id, token, resources: vec![tool], session_id }).await;
+        self.give_goal(&v1::Lease { id, token, resources: vec![tool], session_id, consumed: Vec::new() }).await;
     }
 
     async fn given_back(&mut self, held: Held) {

@@ -154,7 +154,7 @@ pub fn success(instance: InstanceId, attempt: u32) -> Event {
 pub fn lease(id: u64) -> Lease {
     let (kind, endpoint, superclasses) = ("Brain".to_owned(), String::new(), Vec::new());
     let resources = vec![LeasedResource { id: "brain-1".to_owned(), kind, endpoint, superclasses }];
-    Lease { id: LeaseId(id), token: FencingToken(id), resources }
+    Lease { id: LeaseId(id), token: FencingToken(id), resources, consumed: Vec::new() }
 }
 
 fn ended(

@@ -173,7 +173,12 @@ mod tests {
             endpoint: String::new(),
             superclasses: Vec::from_iter((*kind == "VacuumGripper").then(|| "Gripper".to_owned())),
         };
-        Lease { id: LeaseId(1), token: FencingToken(1), resources: units.iter().map(unit).collect() }
+        Lease {
+            id: LeaseId(1),
+            token: FencingToken(1),
+            resources: units.iter().map(unit).collect(),
+            consumed: Vec::new(),
+        }
     }
 
     #[test]

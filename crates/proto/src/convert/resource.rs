@@ -2,13 +2,15 @@
 
 use super::{Malformed, all, each, few, label, missing_choice, name, names, ports, required, wire_ports};
 use crate::types::{
-    Demand, EndingUnits, Holding, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceState,
+    Demand, EndingUnits, Holding, Recalled, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceState,
     ResourceUpdate, SessionStatus, WaitingAcquire,
 };
 use crate::v1;
 use ratn_model::condition::{Comparison, Condition};
 use ratn_model::id::{FencingToken, LeaseId, Revision};
-use ratn_model::resource::{Lease, LeasedResource, Quantity, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::resource::{
+    Lease, LeasedResource, OperatedUnits, Quantity, Requirement, ResourceClass, ResourceOperation,
+};
 use ratn_model::value::Value;
 
 impl From<ResourceClass> for v1::ResourceClass {
@@ -185,7 +187,8 @@ impl TryFrom<v1::Demand> for Demand {
 impl From<Lease> for v1::Lease {
     fn from(lease: Lease) -> v1::Lease {
         let session_id = String::new();
-        v1::Lease { id: lease.id.0, token: lease.token.0, resources: all(lease.resources), session_id }
+        let (resources, consumed) = (all(lease.resources), all(lease.consumed));
+        v1::Lease { id: lease.id.0, token: lease.token.0, resources, session_id, consumed }
     }
 }
 
@@ -197,7 +200,49 @@ impl TryFrom<v1::Lease> for Lease {
             id: LeaseId(lease.id),
             token: FencingToken(lease.token),
             resources: each(lease.resources, "resources")?,
+            consumed: each(lease.consumed, "consumed")?,
         })
+    }
+}
+
+impl From<OperatedUnits> for v1::OperatedUnits {
+    fn from(operated: OperatedUnits) -> v1::OperatedUnits {
+        let OperatedUnits { resource, kind, units, ends_with_session } = operated;
+        v1::OperatedUnits { resource_id: resource, kind, units: units.into(), ends_with_session }
+    }
+}
+
+impl TryFrom<v1::OperatedUnits> for OperatedUnits {
+    type Error = Malformed;
+
+    fn try_from(operated: v1::OperatedUnits) -> Result<OperatedUnits, Malformed> {
+        name(&operated.resource_id, "resource_id")?;
+        name(&operated.kind, "kind")?;
+        Ok(OperatedUnits {
+            resource: operated.resource_id,
+            kind: operated.kind,
+            units: amount(operated.units, "units")?,
+            ends_with_session: operated.ends_with_session,
+        })
+    }
+}
+
+impl From<Option<Recalled>> for v1::RecalledRequest {
+    fn from(recalled: Option<Recalled>) -> v1::RecalledRequest {
+        let known = recalled.is_some();
+        let Recalled { created, operated } = recalled.unwrap_or_default();
+        v1::RecalledRequest { known, created_resource_id: created.unwrap_or_default(), operated: all(operated) }
+    }
+}
+
+impl TryFrom<v1::RecalledRequest> for Option<Recalled> {
+    type Error = Malformed;
+
+    fn try_from(recalled: v1::RecalledRequest) -> Result<Option<Recalled>, Malformed> {
+        label(&recalled.created_resource_id, "created_resource_id")?;
+        let created = Some(recalled.created_resource_id).filter(|id| !id.is_empty());
+        let operated = each(recalled.operated, "operated")?;
+        Ok(recalled.known.then_some(Recalled { created, operated }))
     }
 }
 

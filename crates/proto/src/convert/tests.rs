@@ -11,7 +11,9 @@ use ratn_model::fact::{Change, FactKey, FactPattern, Footprint, Term};
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
 use ratn_model::measurement::{Certainty, Measurement};
 use ratn_model::pose::Pose;
-use ratn_model::resource::{Lease, LeasedResource, Quantity, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::resource::{
+    Lease, LeasedResource, OperatedUnits, Quantity, Requirement, ResourceClass, ResourceOperation,
+};
 use ratn_model::value::{Trajectory, TrajectoryPoint};
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -141,11 +143,13 @@ fn condition() -> impl Strategy<Value = Condition> {
 fn lease() -> impl Strategy<Value = Lease> {
     let resource = (a_name(), a_name(), prop_oneof![Just(String::new()), Just("unix:/a.sock".to_owned())])
         .prop_map(|(id, kind, endpoint)| LeasedResource { superclasses: std::vec![id.clone()], id, kind, endpoint });
-    (any::<u64>(), any::<u64>(), vec(resource, 0..3)).prop_map(|(id, token, resources)| Lease {
-        id: LeaseId(id),
-        token: FencingToken(token),
-        resources,
-    })
+    let consumed =
+        (a_name(), a_name(), amount(), any::<bool>()).prop_map(|(resource, kind, units, ends_with_session)| {
+            OperatedUnits { resource, kind, units, ends_with_session }
+        });
+    (any::<u64>(), any::<u64>(), vec(resource, 0..3), vec(consumed, 0..3)).prop_map(
+        |(id, token, resources, consumed)| Lease { id: LeaseId(id), token: FencingToken(token), resources, consumed },
+    )
 }
 
 fn resource() -> impl Strategy<Value = Resource> {

@@ -264,7 +264,7 @@ mod tests {
 
         fn granted(&mut self, instance: u64) {
             self.knows += 1;
-            let lease = Lease { id: LeaseId(1), token: FencingToken(1), resources: Vec::new() };
+            let lease = Lease { id: LeaseId(1), token: FencingToken(1), resources: Vec::new(), consumed: Vec::new() };
             self.beginnings.event(&Event::Granted { instance: InstanceId(instance), lease }, Revision(self.knows));
         }
 

@@ -3,6 +3,7 @@
 
 use super::{Answer, LONG_BESIDE_OTHERS, OVERDUE, Whom, Withdrawal};
 use crate::decided::{REFUSED_PATIENCE, Unanswered, insist};
+use crate::ledger::late_request;
 use crate::performer::told::Told;
 use crate::record::said;
 use ratn_executive::protocol::{CERTAIN, Event};
@@ -102,11 +103,6 @@ impl Waiting {
         let hand = self.asking.get_mut(&to)?.hand.take();
         Some(hand.ok_or(()).and_then(|hand| hand.send(lease.clone()).map_err(drop)))
     }
-}
-
-/// The id of the request that is made when that one has waited too long beside other runs.
-pub(super) fn late_request(request: &str) -> String {
-    format!("{request}/late")
 }
 
 /// What performs goals says where it is: a resource of that kind that does not is nobody's to give a goal to, whoever made it.

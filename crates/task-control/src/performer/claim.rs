@@ -27,12 +27,23 @@ pub const RUN_KIND: &str = "Run";
 /// # Errors
 /// Where it may not begin beside what is under way, it is under way already, or the resource manager cannot be asked.
 pub async fn claim(resources: &ResourceClient, run: &str, task: &str, alone: bool) -> anyhow::Result<bool> {
+    claim_as("", resources, run, task, alone).await
+}
+
+/// The same, under a request id that who comes back knows; under a fresh one where it is empty.
+pub(super) async fn claim_as(
+    request: &str,
+    resources: &ResourceClient,
+    run: &str,
+    task: &str,
+    alone: bool,
+) -> anyhow::Result<bool> {
     // Before it is seen by others: one that is refused is in nobody's way.
     others(resources, run, alone).await?;
     let claim = Resource::new(run, ResourceClass::Task, RUN_KIND)
         .with_attribute(TASK, Value::String(task.to_owned()))
         .with_attribute(ALONE, Value::Bool(alone));
-    match retry_unanswered(|| resources.create(claim.clone())).await {
+    match retry_unanswered(|| resources.create_once(request, claim.clone())).await {
         Ok(_) => {}
         Err(error) if error.code() == Some(tonic::Code::AlreadyExists) => {
             return Err(NotStarted(format!("{run} is under way on this system")).into());

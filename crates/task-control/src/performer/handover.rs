@@ -213,7 +213,7 @@ mod tests {
             endpoint: String::new(),
             superclasses: vec!["Planner".to_owned()],
         };
-        let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: vec![resource] };
+        let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: vec![resource], consumed: Vec::new() };
         let (mut leases, now) = (Leases::default(), Instant::now());
         leases.granted(FIRST, &lease, (planner(), 0), now);
         let mut commands = asks.to_vec();
@@ -276,7 +276,7 @@ mod tests {
                 endpoint: String::new(),
                 superclasses: Vec::new(),
             };
-            Lease { id: LeaseId(id), token: FencingToken(id), resources: vec![resource] }
+            Lease { id: LeaseId(id), token: FencingToken(id), resources: vec![resource], consumed: Vec::new() }
         };
         let begin = Instant::now();
         let after = |ms: u64| begin + Duration::from_millis(ms);
@@ -314,7 +314,7 @@ mod tests {
 
     #[test]
     fn nothing_is_handed_to_one_that_has_its_answer() {
-        let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: Vec::new() };
+        let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: Vec::new(), consumed: Vec::new() };
         let mut waiting = Waiting::default();
         let (asking, handed) = Asking::for_tests(1, planner(), 1);
         waiting.insert(FIRST, asking);
@@ -336,7 +336,7 @@ mod tests {
         let held = |change: &dyn Fn(&mut Requirement)| {
             let mut requirements = planner();
             requirements.iter_mut().for_each(change);
-            let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: Vec::new() };
+            let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: Vec::new(), consumed: Vec::new() };
             Held {
                 lease,
                 requirements: requirements.clone(),

@@ -7,6 +7,7 @@ mod claim;
 mod giving_back;
 mod goal;
 mod handover;
+mod made_anew;
 mod order;
 mod resume;
 mod stopping;
@@ -18,10 +19,10 @@ mod watch;
 
 pub(super) use resume::{check_world, missing_commits, remembers};
 
-use super::ledger::{Began, Confirmed, Projecting, acquire_request};
+use super::ledger::{Began, Confirmed, Projecting, acquire_request, claim_request, late_request};
 use super::outside::Outside;
 use super::promises::{Making, Promises};
-use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Named, Record, Recorded, Recorder, Root};
+use super::record::{self, Cancelled, Decided, MAX_PENDING_RECORDS, Named, Record, Recorded, Recorder, Root};
 use super::shell::{Place, Urgency};
 use crate::background_runtime::BackgroundRuntime;
 use crate::messages::Messages;
@@ -30,6 +31,7 @@ use acquiring::{Acquiring, Asking, Waiting};
 use anyhow::{Context, bail};
 use came_between::{CameBetween, Left};
 pub(crate) use came_between::{Overtaken, Untouched};
+use claim::claim_as;
 pub use claim::{RUN_KIND, claim};
 use futures::FutureExt;
 use goal::{Given, Performing};
@@ -237,7 +239,7 @@ impl LastAsked {
     /// The id under which it is in the queue after so long: what is needed for certain and has waited for long asks once more.
     fn in_queue(self, waited: Duration) -> String {
         let is_late = self.priority >= CERTAIN && waited >= LONG_BESIDE_OTHERS;
-        if is_late { acquiring::late_request(&self.request) } else { self.request }
+        if is_late { late_request(&self.request) } else { self.request }
     }
 }
 
@@ -289,7 +291,8 @@ impl Performer {
         let told = Told::new(&run);
         let others = claim::look_for_others(resources.clone(), run.clone(), told.clone());
         let others = AbortOnDropHandle::new(tokio::spawn(others));
-        match claim(&resources, &run, &program.name, place.alone).await {
+        let request = if is_own { String::new() } else { claim_request(&run, number) };
+        match claim_as(&request, &resources, &run, &program.name, place.alone).await {
             Ok(has_others) => told.beside_others(has_others),
             // What a run that comes back holds is still its own.
             Err(refused) if is_own => {
@@ -511,7 +514,7 @@ impl Performer {
         let (heard, session, recorded) = (self.heard, self.number, Arc::clone(&self.recorded));
         let closed = self.end().await;
         let Confirmed { operation, failed, .. } = *recorded.borrow();
-        let done = (operation > heard.operation).then_some(Event::Recorded { operation, session });
+        let done = (operation > heard.operation).then(|| record::recorded(operation, session, Vec::new()));
         let failed = failed.filter(|_| heard.failed.is_none()).map(|(instance, unmade)| {
             let reason = closed.as_ref().err().map_or_else(String::new, ToString::to_string);
             Event::RetirementFailed { instance, reason, unmade }
@@ -670,7 +673,7 @@ impl Performer {
             // One that has its answer by now does not wait any more.
             let waiting = match resources.explain(&request).await {
                 Ok(waiting) => waiting,
-                Err(_) => match resources.explain(&acquiring::late_request(&request)).await {
+                Err(_) => match resources.explain(&late_request(&request)).await {
                     Ok(waiting) => waiting,
                     Err(_) => return,
                 },

@@ -2,6 +2,7 @@
 //!
 //! Leases live on with the run's session, if that still lives; what nobody knows to have goes back. Goals are looked for where
 //! they were given. Commits that the world pool does not have, and operations that the log does not say to be done, are made under their ids.
+//! Where the session has ended, `made_anew` says which operations were done.
 //!
 //! ```text
 //! the session that the log names is found ─► it is the run's, with all that is done in it
@@ -11,13 +12,12 @@
 //! ```
 
 use super::Performer;
-use super::acquiring::late_request;
 use super::came_between::{CameBetween, ChangedByOthers, Untouched, refuse, retry_forgotten};
 use super::goal::Given;
 use crate::decided::{Unanswered, Undone, insist};
-use crate::ledger::{Confirmed, Ledger, WentBack, operation_request};
+use crate::ledger::{Confirmed, Ledger, Operated, WentBack, late_request};
 use crate::outside;
-use crate::record::{Decided, Named, Record, commit_next, operate_once, said};
+use crate::record::{Decided, Named, Record, commit_next};
 use crate::shell::Place;
 use anyhow::bail;
 use futures::{StreamExt, stream};
@@ -25,14 +25,12 @@ use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::program::Program;
-use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_proto::types::{Resource, WorldUpdate};
 use ratn_worker::client::{CallError, Channels, ResourceClient, WorldClient, retry_unanswered};
 use ratn_worker::session::Trust;
 use ratn_world::world::World;
-use std::borrow::Cow;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -41,9 +39,6 @@ use tokio_util::sync::CancellationToken;
 
 /// So many withdrawals of before are under way at once.
 const WITHDRAWN_AT_ONCE: usize = 64;
-
-/// As the resource manager names the refusal of what is not there, or not free.
-const NOT_ENOUGH: &str = "NOT_ENOUGH";
 
 /// A revision of the root, and what the facts are there that a run believes to be otherwise.
 pub(crate) type Changed = (Revision, Vec<(FactKey, Option<Value>)>);
@@ -174,6 +169,7 @@ impl Performer {
         mirror: &World,
         now: Timestamp,
     ) -> anyhow::Result<Vec<Event>> {
+        let settled = if self.is_own { None } else { Some(self.settle(&ledger).await?) };
         let (missing, revision, facts) = self.commit_again(program, &ledger, now).await?;
         let changed = changed(revision, facts, &missing.behind, mirror);
         let changed = changed.map(|(revision, facts)| Event::WorldChanged { revision, facts });
@@ -184,14 +180,13 @@ impl Performer {
         }
         // Operations wait for that.
         let withdrawn = self.withdraw_again(std::mem::take(&mut ledger.withdrawn));
-        let mut recorded = None;
-        if self.is_own {
-            self.sweep(&ledger, withdrawn).await?;
-        } else {
-            self.make_anew(&ledger).await?;
+        let mut recorded = Vec::new();
+        if let Some(settled) = settled {
+            recorded = self.make_anew(settled, &ledger).await?;
             let operation = ledger.operations;
             self.confirm(Confirmed { operation, ..self.confirmed() });
-            recorded = Some(Event::Recorded { operation, session: self.number });
+        } else {
+            self.sweep(&ledger, withdrawn).await?;
         }
         self.go_on_recording(program, &ledger, missing)?;
         if ledger.failed.is_some() {
@@ -220,10 +215,14 @@ impl Performer {
         mut ledger: Ledger,
         now: Timestamp,
     ) -> anyhow::Result<(usize, usize)> {
+        let settled = if self.is_own { None } else { Some(self.settle(&ledger).await?) };
         let (missing, ..) = self.commit_again(program, &ledger, now).await?;
         let commits = missing.made + missing.behind.len();
-        if !self.is_own {
-            let removed = self.remove_again(&ledger, &ledger.created()).await?;
+        if let Some(settled) = settled {
+            let removed = settled.removals();
+            if removed > 0 {
+                self.make_anew(settled, &ledger).await?;
+            }
             // Nothing of it is open any more, for whoever comes next.
             self.recorded.send_modify(|recorded| recorded.operation = ledger.operations);
             self.go_on_recording(program, &ledger, missing)?;
@@ -251,7 +250,7 @@ impl Performer {
             self.knows_what_went_back(ledger, there, now);
         }
         self.refuse_what_came_between(program, &ledger.commits[there..], root).await?;
-        let first = ledger.open_operations().next().map_or(u64::MAX, |(number, ..)| *number);
+        let first = ledger.open_operations().next().map_or(u64::MAX, |one| one.number);
         let (missing, mut made) = (&ledger.commits[there..], 0);
         for decided in missing.iter().take_while(|decided| decided.behind < first) {
             let untouched = self.untouched(program, decided, seen);
@@ -310,7 +309,7 @@ impl Performer {
         let seen = missing.seen;
         let open: Vec<_> = if self.is_own { ledger.open_operations().cloned().collect() } else { Vec::new() };
         let (operations, mut behind) = (open.len(), missing.behind.into_iter().peekable());
-        for (number, instance, operations) in open {
+        for Operated { number, instance, operations, .. } in open {
             while let Some(decided) = behind.next_if(|decided| decided.behind < number) {
                 let untouched = self.untouched(program, &decided, seen);
                 self.commit(decided, Some(untouched), None)?;
@@ -421,65 +420,6 @@ impl Performer {
             drop(returns);
         });
         Ok(())
-    }
-
-    /// The old session is gone with what it had made and used up. What others had made and the run deleted is gone for good, and so is some of what
-    /// it used up: that is repeated only where it may not be done.
-    async fn make_anew(&self, ledger: &Ledger) -> anyhow::Result<()> {
-        let created = ledger.created();
-        self.remove_again(ledger, &created).await?;
-        let mut again: Vec<&Requirement> = created.iter().collect();
-        for consumption in ledger.used_up() {
-            if self.came_back(consumption, &created).await? {
-                again.push(consumption);
-            }
-        }
-        for (index, operation) in again.into_iter().enumerate() {
-            let request = format!("{}/again-{}.{index}", self.run, self.resumptions);
-            if let Err(undone) = operate_once(&self.resources, &self.trust, &request, operation).await {
-                bail!("`{operation}` was so before and cannot be made so again: {undone}");
-            }
-        }
-        Ok(())
-    }
-
-    /// Does what takes away from others and may not be done; how much of that.
-    async fn remove_again(&self, ledger: &Ledger, created: &[Requirement]) -> anyhow::Result<usize> {
-        let mut removed = 0;
-        for (number, instance, index, removal) in ledger.open_removals() {
-            if removal.operation == ResourceOperation::Consume && self.came_back(removal, created).await? {
-                continue;
-            }
-            let request = operation_request(&self.run, instance, number, index);
-            match operate_once(&self.resources, &self.trust, &request, removal).await {
-                Ok(()) => removed += 1,
-                Err(Undone::Failed(error)) if error.reason() == NOT_ENOUGH && !self.is_there(removal).await? => {
-                    tracing::warn!("`{removal}` was not repeated, as it was done before: {}", said(&error));
-                }
-                Err(undone) => bail!("`{removal}` may not be done and cannot be repeated: {undone}"),
-            }
-        }
-        Ok(removed)
-    }
-
-    /// Whether there is anything of what is to be taken away, whoever holds it.
-    async fn is_there(&self, removal: &Requirement) -> anyhow::Result<bool> {
-        let kinds = [removal.kind.as_str()];
-        let there = retry_unanswered(|| self.resources.list(&kinds)).await?;
-        Ok(there.iter().any(|one| removal.accepts(|name| one.attributes.get(name).map(Cow::Borrowed))))
-    }
-
-    /// Whether what was used up came back with the end of the session: what is renewable did, and what the run creates itself is made anew.
-    async fn came_back(&self, consumption: &Requirement, created: &[Requirement]) -> anyhow::Result<bool> {
-        let fits =
-            |attributes: &BTreeMap<String, Value>| consumption.accepts(|name| attributes.get(name).map(Cow::Borrowed));
-        if created.iter().any(|one| one.kind == consumption.kind && fits(&one.attributes)) {
-            return Ok(true);
-        }
-        let kinds = [consumption.kind.as_str()];
-        let there = retry_unanswered(|| self.resources.list(&kinds)).await?;
-        let mut fitting = there.iter().filter(|resource| fits(&resource.attributes)).peekable();
-        Ok(fitting.peek().is_none() || fitting.any(|resource| resource.renewable))
     }
 }
 

@@ -154,7 +154,8 @@ mod tests {
     use ratn_proto::types::Goal;
 
     fn entry(id: &str, resource: &str, lease: u64) -> Arc<GoalEntry> {
-        let lease = Lease { id: LeaseId(lease), token: FencingToken(lease), resources: Vec::new() };
+        let lease =
+            Lease { id: LeaseId(lease), token: FencingToken(lease), resources: Vec::new(), consumed: Vec::new() };
         let session = format!("session-{}", lease.id.0);
         let lease = (lease.id.0 > 0).then_some(lease);
         let goal = Goal { id: id.to_owned(), action: "move".to_owned(), session, lease, ..Goal::default() };

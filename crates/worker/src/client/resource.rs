@@ -7,11 +7,11 @@ use crate::multiplex::SessionCalls;
 use crate::multiplex::client::Multiplexer;
 use crate::trace::Traced;
 use ratn_model::id::LeaseId;
-use ratn_model::resource::{Lease, Requirement};
+use ratn_model::resource::{Lease, OperatedUnits, Requirement};
 use ratn_model::value::Value;
 use ratn_proto::convert::{Malformed, all, each, required, wire_ports};
 use ratn_proto::types::{
-    Demand, Provision, Resource, ResourceFilter, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition,
+    Demand, Provision, Recalled, Resource, ResourceFilter, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition,
 };
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
@@ -21,6 +21,9 @@ use ratn_proto::{MAX_MESSAGE_BYTES, PAGE_BYTES};
 use std::collections::BTreeMap;
 use std::time::Duration;
 use tonic::Streaming;
+
+/// Maximum number of requests in one recall call.
+const RECALLED_AT_ONCE: usize = 1_000;
 
 /// A client of one resource manager, in the name of one session. Every mutation gets a fresh request id.
 #[derive(Debug, Clone)]
@@ -128,10 +131,60 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn consume_once(&self, request: &str, requirement: Requirement) -> Result<Vec<String>, CallError> {
+        Ok(self.consume_target(request, requirement, "").await?.resource_ids)
+    }
+
+    /// As [`ResourceClient::consume_once`], of one resource alone if one is named. Returns how much of which, if the manager says that.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn consume_units_once(
+        &self,
+        request: &str,
+        requirement: Requirement,
+        resource: &str,
+    ) -> Result<Option<Vec<OperatedUnits>>, CallError> {
+        let answer = self.consume_target(request, requirement, resource).await?;
+        self.units(&answer.resource_ids, answer.consumed)
+    }
+
+    async fn consume_target(
+        &self,
+        request: &str,
+        requirement: Requirement,
+        resource: &str,
+    ) -> Result<v1::ConsumeResponse, CallError> {
         let (request_id, session_id) = self.mutation(request);
-        let question = v1::ConsumeRequest { request_id, session_id, requirement: Some(requirement.into()) };
+        let (requirement, resource_id) = (Some(requirement.into()), resource.to_owned());
+        let question = v1::ConsumeRequest { request_id, session_id, requirement, resource_id };
         let answer = self.client.clone().consume(question).await.map_err(|status| self.failed(&status))?;
-        Ok(answer.into_inner().resource_ids)
+        Ok(answer.into_inner())
+    }
+
+    /// What was done, if it is said of every resource.
+    fn units(&self, ids: &[String], units: Vec<v1::OperatedUnits>) -> Result<Option<Vec<OperatedUnits>>, CallError> {
+        let is_said = units.len() == ids.len();
+        let units = each(units, "units").map_err(|m| self.malformed(m))?;
+        Ok(is_said.then_some(units))
+    }
+
+    /// What requests of before were answered, in the order of these ids: `None` where that is not known.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn recall(&self, requests: &[String]) -> Result<Vec<Option<Recalled>>, CallError> {
+        let mut recalled = Vec::with_capacity(requests.len());
+        for some in requests.chunks(RECALLED_AT_ONCE) {
+            let question = v1::RecallRequest { session_id: self.session.clone(), request_ids: some.to_vec() };
+            let answer = self.client.clone().recall(question).await.map_err(|status| self.failed(&status))?;
+            let answer: Vec<Option<Recalled>> =
+                each(answer.into_inner().requests, "requests").map_err(|m| self.malformed(m))?;
+            if answer.len() != some.len() {
+                return Err(self.malformed(Malformed::new("requests", "are not as many as were asked for")));
+            }
+            recalled.extend(answer);
+        }
+        Ok(recalled)
     }
 
     /// Removes one resource by its id.
@@ -159,14 +212,33 @@ impl ResourceClient {
         request: &str,
         requirement: Requirement,
     ) -> Result<Vec<String>, CallError> {
-        self.delete_target(request, v1::delete_request::Target::Requirement(requirement.into())).await
+        let target = v1::delete_request::Target::Requirement(requirement.into());
+        Ok(self.delete_target(request, target).await?.resource_ids)
     }
 
-    async fn delete_target(&self, request: &str, target: v1::delete_request::Target) -> Result<Vec<String>, CallError> {
+    /// The same; how much of which, if the manager says that.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn delete_units_once(
+        &self,
+        request: &str,
+        requirement: Requirement,
+    ) -> Result<Option<Vec<OperatedUnits>>, CallError> {
+        let target = v1::delete_request::Target::Requirement(requirement.into());
+        let answer = self.delete_target(request, target).await?;
+        self.units(&answer.resource_ids, answer.deleted)
+    }
+
+    async fn delete_target(
+        &self,
+        request: &str,
+        target: v1::delete_request::Target,
+    ) -> Result<v1::DeleteResponse, CallError> {
         let (request_id, session_id) = self.mutation(request);
         let question = v1::DeleteRequest { request_id, session_id, target: Some(target) };
         let answer = self.client.clone().delete(question).await.map_err(|status| self.failed(&status))?;
-        Ok(answer.into_inner().resource_ids)
+        Ok(answer.into_inner())
     }
 
     /// Waits for resources of one kind and blocks them.

@@ -236,7 +236,12 @@ pub fn lease(token: u64, resources: &[(&str, &str, &str)]) -> Lease {
         endpoint: (*endpoint).to_owned(),
         superclasses: Vec::new(),
     };
-    Lease { id: LeaseId(token), token: FencingToken(token), resources: resources.iter().map(resource).collect() }
+    Lease {
+        id: LeaseId(token),
+        token: FencingToken(token),
+        resources: resources.iter().map(resource).collect(),
+        consumed: Vec::new(),
+    }
 }
 
 /// Gives a goal and returns once it has said something; its result comes from the task.

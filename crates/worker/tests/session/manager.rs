@@ -112,7 +112,7 @@ impl ResourceService for Manager {
         let Some(delete_request::Target::ResourceId(id)) = request.into_inner().target else { unreachable!() };
         self.pool.lock().unwrap().resources.remove(&id).ok_or_else(|| Status::not_found(id.clone()))?;
         self.changed.send_replace(());
-        Ok(Response::new(DeleteResponse { resource_ids: vec![id], revision: 1 }))
+        Ok(Response::new(DeleteResponse { resource_ids: vec![id], revision: 1, deleted: Vec::new() }))
     }
 
     type KeepAliveStream = BoxStream<'static, Result<KeepAliveResponse, Status>>;
@@ -153,6 +153,10 @@ impl ResourceService for Manager {
             Ok(KeepAliveResponse { session_id: ping.session_id, ttl_ms: ping.ttl_ms, created, revision: 1, number })
         });
         Ok(Response::new(answers.boxed()))
+    }
+
+    async fn recall(&self, _: Request<RecallRequest>) -> Result<Response<RecallResponse>, Status> {
+        Err(Status::unimplemented("not under test"))
     }
 
     async fn consume(&self, _: Request<ConsumeRequest>) -> Result<Response<ConsumeResponse>, Status> {

@@ -72,7 +72,7 @@ mod tests {
     fn lease() -> Lease {
         let resource =
             LeasedResource { id: "t1".into(), kind: "Tool".into(), endpoint: String::new(), superclasses: Vec::new() };
-        Lease { id: LeaseId(7), token: FencingToken(1), resources: vec![resource] }
+        Lease { id: LeaseId(7), token: FencingToken(1), resources: vec![resource], consumed: Vec::new() }
     }
 
     fn tool(id: &str, lease: u64) -> Resource {

@@ -92,6 +92,13 @@ pub(in super::super) enum Message {
         session: SessionId,
         request_id: String,
     },
+    /// What requests of before were answered.
+    Recall {
+        speaker: Speaker,
+        session: SessionId,
+        request_ids: Vec<String>,
+        answer: Answer<Vec<Option<Reply>>>,
+    },
     /// Looks at so many more resources; whether it has looked at all.
     Search {
         search: Search,

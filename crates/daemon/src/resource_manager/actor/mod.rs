@@ -219,6 +219,11 @@ impl Core for ResourceCore {
                     let _ = self.pool.undo(now, &session, &request_id);
                 }
             }
+            Message::Recall { speaker, session, request_ids, answer } => {
+                let recalled = request_ids.iter().map(|id| self.pool.recall(now, &speaker, &session, id));
+                let recalled: Result<Vec<_>, _> = recalled.collect();
+                context.reply(answer, recalled.map_err(|error| status::of_error(&error)));
+            }
             Message::Search { mut search, resources, answer } => {
                 let finished = self.pool.go_on(&mut search, resources);
                 context.tell(answer, (search, finished));
@@ -380,6 +385,7 @@ fn refuse_change(message: Message, stopped: Status, context: &mut ResourceTurn) 
         Message::ReportShortage { answer, .. } => context.reply(answer, Err(stopped)),
         Message::Abandon { .. } | Message::Return { .. } | Message::Undo { .. } => {}
         read @ (Message::Search { .. }
+        | Message::Recall { .. }
         | Message::Get { .. }
         | Message::List { .. }
         | Message::Revision { .. }

@@ -105,6 +105,11 @@ impl v1::resource_service_server::ResourceService for Service {
         resources::delete(&self.requests, &caller, request).await.map(Response::new)
     }
 
+    async fn recall(&self, request: Request<v1::RecallRequest>) -> Result<Response<v1::RecallResponse>, Status> {
+        let (caller, request) = parts(request);
+        resources::recall(&self.requests, &caller, request).await.map(Response::new)
+    }
+
     async fn exists(&self, request: Request<v1::ExistsRequest>) -> Result<Response<v1::ExistsResponse>, Status> {
         resources::exists(&self.requests, request.into_inner()).await.map(Response::new)
     }

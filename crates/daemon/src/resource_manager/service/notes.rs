@@ -139,7 +139,12 @@ mod tests {
             endpoint: String::new(),
             superclasses: Vec::new(),
         };
-        Lease { id: LeaseId(id), token: FencingToken(id), resources: resources.iter().map(resource).collect() }
+        Lease {
+            id: LeaseId(id),
+            token: FencingToken(id),
+            resources: resources.iter().map(resource).collect(),
+            consumed: Vec::new(),
+        }
     }
 
     #[test]

@@ -1,14 +1,14 @@
 //! Calls on the resources themselves: create, consume, delete, and reading them.
 
 use super::requests::{Requests, odd_reply, optional_session, session};
-use crate::access::Caller;
+use crate::access::{Caller, speaker};
 use crate::details::status;
 use crate::paging::{self, Filled, Page};
 use crate::resource_manager::actor::Message;
 use crate::resource_manager::wire;
 use ratn_model::resource::{Requirement, ResourceClass};
-use ratn_proto::convert::{kind, name, required};
-use ratn_proto::types::{ENDPOINT_ATTRIBUTE, Resource, ResourceFilter};
+use ratn_proto::convert::{all, kind, name, required};
+use ratn_proto::types::{ENDPOINT_ATTRIBUTE, Recalled, Resource, ResourceFilter};
 use ratn_proto::v1;
 use ratn_resources::{Reply, Request, ResourceSpec, Search};
 use tonic::{Code, Status};
@@ -65,10 +65,48 @@ pub(super) async fn consume(
 ) -> Result<v1::ConsumeResponse, Status> {
     let requirement: Requirement = required(request.requirement, "requirement")?;
     let session = session(&request.session_id)?;
-    let consume = Request::Consume { session, requirement };
+    let resource = Some(request.resource_id).filter(|id| !id.is_empty());
+    resource.as_ref().map_or(Ok(()), |id| name(id, "resource_id"))?;
+    let consume = Request::Consume { session, requirement, resource };
     let (reply, revision) = requests.perform(caller, request.request_id, consume).await?;
-    let Reply::Touched(resource_ids) = reply else { return Err(odd_reply(&reply)) };
-    Ok(v1::ConsumeResponse { resource_ids, revision })
+    let (resource_ids, consumed) = operated(reply)?;
+    Ok(v1::ConsumeResponse { resource_ids, revision, consumed })
+}
+
+/// The ids of the resources, and how much of each; nothing of that where an earlier version performed the request.
+fn operated(reply: Reply) -> Result<(Vec<String>, Vec<v1::OperatedUnits>), Status> {
+    match reply {
+        Reply::Operated(units) => {
+            let ids = units.iter().map(|one| one.resource.clone()).collect();
+            Ok((ids, all(units)))
+        }
+        Reply::Touched(ids) => Ok((ids, Vec::new())),
+        odd => Err(odd_reply(&odd)),
+    }
+}
+
+pub(super) async fn recall(
+    requests: &Requests,
+    caller: &Caller,
+    request: v1::RecallRequest,
+) -> Result<v1::RecallResponse, Status> {
+    let session = session(&request.session_id)?;
+    request.request_ids.iter().try_for_each(|id| name(id, "request_ids"))?;
+    if request.request_ids.len() > MOST_IDS {
+        let message = format!("request_ids: there are more than {MOST_IDS}");
+        return Err(status(Code::InvalidArgument, "MALFORMED", message));
+    }
+    let (speaker, request_ids) = (speaker(caller), request.request_ids);
+    let recall = |answer| Message::Recall { speaker, session, request_ids, answer };
+    let recalled = requests.actor().request(recall).await?;
+    let recalled = recalled.into_iter().map(|reply| {
+        reply.map(|reply| match reply {
+            Reply::Created { id, .. } => Recalled { created: Some(id), ..Recalled::default() },
+            Reply::Operated(operated) => Recalled { operated, ..Recalled::default() },
+            _ => Recalled::default(),
+        })
+    });
+    Ok(v1::RecallResponse { requests: recalled.map(Into::into).collect() })
 }
 
 pub(super) async fn delete(
@@ -80,23 +118,23 @@ pub(super) async fn delete(
     let target = request
         .target
         .ok_or_else(|| status(Code::InvalidArgument, "MALFORMED", "target: resource_id or requirement is missing"))?;
-    let (resource_ids, revision) = match target {
+    let (resource_ids, revision, deleted) = match target {
         Target::ResourceId(id) => {
             name(&id, "resource_id")?;
             let session = optional_session(&request.session_id)?;
             let delete = Request::Delete { session, id: id.clone() };
             let (_, revision) = requests.perform(caller, request.request_id, delete).await?;
-            (vec![id], revision)
+            (vec![id], revision, Vec::new())
         }
         Target::Requirement(requirement) => {
             let requirement = Requirement::try_from(requirement).map_err(|m| m.within("requirement"))?;
             let delete = Request::DeleteUnits { session: session(&request.session_id)?, requirement };
             let (reply, revision) = requests.perform(caller, request.request_id, delete).await?;
-            let Reply::Touched(ids) = reply else { return Err(odd_reply(&reply)) };
-            (ids, revision)
+            let (ids, deleted) = operated(reply)?;
+            (ids, revision, deleted)
         }
     };
-    Ok(v1::DeleteResponse { resource_ids, revision })
+    Ok(v1::DeleteResponse { resource_ids, revision, deleted })
 }
 
 pub(super) async fn exists(requests: &Requests, request: v1::ExistsRequest) -> Result<v1::ExistsResponse, Status> {

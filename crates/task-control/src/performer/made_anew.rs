@@ -1,0 +1,117 @@
+//! Coming back to a run whose session has ended: which of its operations are done is asked of the resource manager, what went with the session is made
+//! so again, and the rest is done.
+//!
+//! Nothing that is made so again outlasts the new session, and what is done for the first time is done under its own request id. So a resumption that
+//! dies on the way leaves nothing that the next one does not find.
+
+use super::Performer;
+use crate::decided::{Unanswered, Undone, insist};
+use crate::ledger::{Account, Answers, Created, Ledger, Settled, Unfinished, UsedUp, operation_request};
+use crate::record::{operate_once, recorded};
+use anyhow::bail;
+use ratn_executive::protocol::Event;
+use ratn_model::resource::{OperatedUnits, Requirement, ResourceOperation};
+use ratn_worker::client::retry_unanswered;
+use std::collections::BTreeMap;
+
+/// As the resource manager names a resource that is not there.
+const GONE: &str = "RESOURCE_UNKNOWN";
+
+/// What the run had created before, under its new ids.
+type Renamed = BTreeMap<String, String>;
+
+impl Performer {
+    /// What has become of the operations of the run whose answers nobody has heard, where its session has ended; of one that lives they are asked for
+    /// again.
+    pub(super) async fn settle(&self, ledger: &Ledger) -> anyhow::Result<Settled> {
+        let requests = ledger.unheard_requests();
+        let answers = match retry_unanswered(|| self.resources.recall(&requests)).await {
+            Ok(answers) => requests.into_iter().zip(answers).collect(),
+            // It knows nothing of that: an earlier version.
+            Err(error) if error.code() == Some(tonic::Code::Unimplemented) => Answers::new(),
+            Err(error) => return Err(error.into()),
+        };
+        Ok(ledger.settle(&answers)?)
+    }
+
+    /// The old session is gone with what it had made and used up: that is made so again. What others had made and the run deleted is gone for good,
+    /// as is some of what it used up. Then what was not done is done. What the log is to say of that.
+    pub(super) async fn make_anew(&self, settled: Settled, before: &Ledger) -> anyhow::Result<Vec<Event>> {
+        let Settled { account, done, open } = settled;
+        if let Some(operation) = account.unknown() {
+            bail!(
+                "what `{operation}` has come to is not in the log, as the resource manager did not say it (one of an earlier version does \
+                 not): it went with the run's session and cannot be made so again; run the task again"
+            );
+        }
+        let renamed = self.create_anew(&account).await?;
+        self.use_up_anew(&account, &renamed).await?;
+        let last = done.last().map_or(before.recorded, |(number, _)| *number);
+        let known =
+            |(number, units): (u64, Vec<_>)| recorded(number, before.session, units.into_iter().map(Some).collect());
+        let mut told: Vec<Event> = done.into_iter().map(known).collect();
+        told.push(Event::Recorded {
+            operation: last,
+            session: self.number,
+            units: Vec::new(),
+            renamed: renamed.clone(),
+        });
+        for unfinished in open {
+            told.push(self.operate_anew(unfinished, &renamed).await?);
+        }
+        Ok(told)
+    }
+
+    /// What the run had created is there again; its new ids by those of before.
+    async fn create_anew(&self, account: &Account) -> anyhow::Result<Renamed> {
+        let mut renamed = BTreeMap::new();
+        for (index, Created { resource, left }) in account.created().iter().enumerate() {
+            let request = format!("{}/again-{}.{index}", self.run, self.resumptions);
+            match operate_once(&self.resources, &self.trust, &request, left).await {
+                Ok(made) => renamed.extend(made.into_iter().flatten().map(|made| (resource.clone(), made.resource))),
+                Err(undone) => bail!("`{left}` was so before and cannot be made so again: {undone}"),
+            }
+        }
+        Ok(renamed)
+    }
+
+    /// What the run had used up of what returned, or is there again, is used up, of the same resources. What has gone since has gone with that.
+    async fn use_up_anew(&self, account: &Account, renamed: &Renamed) -> anyhow::Result<()> {
+        for (index, (resource, UsedUp { kind, units })) in account.used_up().enumerate() {
+            let resource = renamed.get(resource).map_or(resource, String::as_str);
+            let request = format!("{}/used-again-{}.{index}", self.run, self.resumptions);
+            let used_up = Requirement { count: *units, ..Requirement::new(ResourceOperation::Consume, kind) };
+            let ask = || self.resources.consume_units_once(&request, used_up.clone(), resource);
+            match insist(&self.trust, Unanswered::Waits, ask).await {
+                Ok(_) => {}
+                Err(Undone::Failed(error)) if error.reason() == GONE => {}
+                Err(undone) => bail!("`{used_up}` of {resource} was so before and cannot be made so again: {undone}"),
+            }
+        }
+        Ok(())
+    }
+
+    /// Does the rest of an operation.
+    async fn operate_anew(&self, unfinished: Unfinished, renamed: &Renamed) -> anyhow::Result<Event> {
+        let Unfinished { number, instance, operations, done } = unfinished;
+        let first = done.len();
+        let mut units: Vec<_> = done.into_iter().map(|done| Some(under_new_ids(done, renamed))).collect();
+        for (index, operation) in operations.iter().enumerate().skip(first) {
+            let request = operation_request(&self.run, instance, number, index);
+            match operate_once(&self.resources, &self.trust, &request, operation).await {
+                Ok(done) => units.push(done),
+                Err(undone) => bail!("`{operation}` was not done before, and cannot be done now: {undone}"),
+            }
+        }
+        Ok(recorded(number, self.number, units))
+    }
+}
+
+fn under_new_ids(mut units: Vec<OperatedUnits>, renamed: &Renamed) -> Vec<OperatedUnits> {
+    for one in &mut units {
+        if let Some(new) = renamed.get(&one.resource) {
+            one.resource.clone_from(new);
+        }
+    }
+    units
+}
