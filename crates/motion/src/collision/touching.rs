@@ -60,7 +60,7 @@ impl<'a> Checker<'a> {
     pub(crate) fn told(&self, touch: &Touch, depth_m: f64) -> Collision {
         let (moving, other) = (&self.moving[touch.moving].name, &self.obstacles[touch.obstacle].name);
         let (moving, other) = (moving.clone(), other.clone());
-        Collision { moving, other, depth_m, padding_m: 0.0, by_spheres: false }
+        Collision { moving, other, depth_m, padding_m: 0.0 }
     }
 
     /// Something that stands in the scene and may be touched.

@@ -518,6 +518,26 @@ pub struct Lease {
     /// The session that holds it. Set by the manager; in a goal it may be empty, and a provider compares it where it is not.
     #[prost(string, tag = "4")]
     pub session_id: ::prost::alloc::string::String,
+    /// What the grant has used up.
+    #[prost(message, repeated, tag = "5")]
+    pub consumed: ::prost::alloc::vec::Vec<OperatedUnits>,
+}
+/// Units of one resource that were created, deleted or used up.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct OperatedUnits {
+    /// The resource's id.
+    #[prost(string, tag = "1")]
+    pub resource_id: ::prost::alloc::string::String,
+    /// Its kind, which may be below the one that was asked for.
+    #[prost(string, tag = "2")]
+    pub kind: ::prost::alloc::string::String,
+    /// How much of it.
+    #[prost(double, tag = "3")]
+    pub units: f64,
+    /// Whether that is over with the session that it was done for: what was created vanishes, what was used up returns or vanishes, and what
+    /// was deleted would have vanished. Otherwise it stays so.
+    #[prost(bool, tag = "4")]
+    pub ends_with_session: bool,
 }
 /// A resource under a lease.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -567,9 +587,12 @@ pub struct ConsumeRequest {
     /// What; its operation is consume.
     #[prost(message, optional, tag = "3")]
     pub requirement: ::core::option::Option<Requirement>,
+    /// Of this resource alone; NOT_FOUND when it is not there. Empty for any that fits.
+    #[prost(string, tag = "4")]
+    pub resource_id: ::prost::alloc::string::String,
 }
 /// What was consumed.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ConsumeResponse {
     /// The resources of which units were consumed.
     #[prost(string, repeated, tag = "1")]
@@ -577,6 +600,9 @@ pub struct ConsumeResponse {
     /// The pool's revision after it.
     #[prost(uint64, tag = "2")]
     pub revision: u64,
+    /// How much of each. Empty where an earlier version performed the request.
+    #[prost(message, repeated, tag = "3")]
+    pub consumed: ::prost::alloc::vec::Vec<OperatedUnits>,
 }
 /// Asks for resources to be removed.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -605,7 +631,7 @@ pub mod delete_request {
     }
 }
 /// What was removed.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct DeleteResponse {
     /// Their ids.
     #[prost(string, repeated, tag = "1")]
@@ -613,6 +639,40 @@ pub struct DeleteResponse {
     /// The pool's revision after it.
     #[prost(uint64, tag = "2")]
     pub revision: u64,
+    /// How much of each. Empty for one that was deleted by its id, and where an earlier version performed the request.
+    #[prost(message, repeated, tag = "3")]
+    pub deleted: ::prost::alloc::vec::Vec<OperatedUnits>,
+}
+/// Asks what requests came to.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct RecallRequest {
+    /// A session of the caller's: what is asked for was for this one or for another of the same opener.
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+    /// The requests, at most 1,000.
+    #[prost(string, repeated, tag = "2")]
+    pub request_ids: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+}
+/// What they came to.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct RecallResponse {
+    /// In the order of the question.
+    #[prost(message, repeated, tag = "1")]
+    pub requests: ::prost::alloc::vec::Vec<RecalledRequest>,
+}
+/// What one request came to.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct RecalledRequest {
+    /// Whether its answer is known. Of one caller the oldest answers are forgotten first: one that is not known was never performed where that of
+    /// an older request is.
+    #[prost(bool, tag = "1")]
+    pub known: bool,
+    /// The id of what it created; empty for another request.
+    #[prost(string, tag = "2")]
+    pub created_resource_id: ::prost::alloc::string::String,
+    /// What it deleted or used up. Empty for another request, and where an earlier version performed it.
+    #[prost(message, repeated, tag = "3")]
+    pub operated: ::prost::alloc::vec::Vec<OperatedUnits>,
 }
 /// Asks for resources of one kind.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -1649,6 +1709,29 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "Delete"));
             self.inner.unary(req, path, codec).await
         }
+        /// What requests of before came to, by their ids: for who has not heard the answer, and has lost the session that they were for. Performs
+        /// nothing.
+        pub async fn recall(
+            &mut self,
+            request: impl tonic::IntoRequest<super::RecallRequest>,
+        ) -> std::result::Result<tonic::Response<super::RecallResponse>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/ratn.v1.ResourceService/Recall",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("ratn.v1.ResourceService", "Recall"));
+            self.inner.unary(req, path, codec).await
+        }
         /// Waits for resources of one kind and blocks them: an acquire of one requirement.
         pub async fn block(
             &mut self,
@@ -2087,6 +2170,12 @@ pub mod resource_service_server {
             &self,
             request: tonic::Request<super::DeleteRequest>,
         ) -> std::result::Result<tonic::Response<super::DeleteResponse>, tonic::Status>;
+        /// What requests of before came to, by their ids: for who has not heard the answer, and has lost the session that they were for. Performs
+        /// nothing.
+        async fn recall(
+            &self,
+            request: tonic::Request<super::RecallRequest>,
+        ) -> std::result::Result<tonic::Response<super::RecallResponse>, tonic::Status>;
         /// Waits for resources of one kind and blocks them: an acquire of one requirement.
         async fn block(
             &self,
@@ -2427,6 +2516,51 @@ pub mod resource_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = DeleteSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/ratn.v1.ResourceService/Recall" => {
+                    #[allow(non_camel_case_types)]
+                    struct RecallSvc<T: ResourceService>(pub Arc<T>);
+                    impl<
+                        T: ResourceService,
+                    > tonic::server::UnaryService<super::RecallRequest>
+                    for RecallSvc<T> {
+                        type Response = super::RecallResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::RecallRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ResourceService>::recall(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = RecallSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

@@ -2,6 +2,7 @@
     Method { service: "ratn.v1.ResourceService", name: "Create", operation: Some(Operation::Create) },
     Method { service: "ratn.v1.ResourceService", name: "Consume", operation: Some(Operation::Consume) },
     Method { service: "ratn.v1.ResourceService", name: "Delete", operation: Some(Operation::Delete) },
+    Method { service: "ratn.v1.ResourceService", name: "Recall", operation: Some(Operation::Session) },
     Method { service: "ratn.v1.ResourceService", name: "Block", operation: Some(Operation::Acquire) },
     Method { service: "ratn.v1.ResourceService", name: "Withdraw", operation: Some(Operation::Acquire) },
     Method { service: "ratn.v1.ResourceService", name: "Release", operation: Some(Operation::Release) },
