@@ -229,7 +229,7 @@ fn what_goes_the_shortest_way_out_as_far_as_it_is_deep_is_out() {
     let mut random = ChaCha8Rng::seed_from_u64(2);
     let mut deep = 0;
     for _ in 0..4_000 {
-        let mut body = |random: &mut ChaCha8Rng| {
+        let body = |random: &mut ChaCha8Rng| {
             let mut length = || 10_f64.powf(random.random_range(-2.3..-0.4));
             let (a, b, c) = (length(), length(), length());
             let is_box = random.random_bool(0.5);
