@@ -31,6 +31,7 @@ pub mod shell;
 mod spans;
 #[cfg(test)]
 mod task_for_tests;
+mod waits_for;
 
 pub use background_runtime::BackgroundRuntime;
 pub use interrupt::{Interrupt, Interrupter};

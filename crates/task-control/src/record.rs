@@ -7,6 +7,7 @@ use super::ledger::{Began, Confirmed, Projecting, created, operation_request};
 use super::performer::{Answer, Untouched};
 use super::promises::{Made, Promises};
 use super::safe_on_disk::Mark;
+use super::waits_for::{Waiting, WaitsFor};
 use futures::FutureExt;
 use ratn_executive::protocol::{Event, Unmade};
 use ratn_model::fact::Change;
@@ -144,6 +145,8 @@ pub(super) struct Recorder {
     pub(super) root: Root,
     /// What the pool promises goes there.
     pub(super) promises: Promises,
+    /// Whom it waits for.
+    pub(super) waiting: Waiting,
 }
 
 /// The pool's root as far as it is known: what the run's own revisions come to there, and what it was told of others'. Clones share it.
@@ -199,7 +202,7 @@ impl Recorder {
                     let (instance, under_way) = (decided.instance, UnderWay { id: decided.id(&self.run), over });
                     let _answered = under_way.over.clone().drop_guard();
                     let mut with_it = Vec::new();
-                    let mut safe = pin!(unsafe_on_disk(instance, safe));
+                    let mut safe = pin!(self.unsafe_on_disk(instance, safe));
                     let refused = loop {
                         tokio::select! {
                             biased;
@@ -262,6 +265,7 @@ impl Recorder {
             if recorded.is_ok() {
                 self.confirm(confirms);
             }
+            self.waiting.set(WaitsFor::Nobody);
             // Where nobody hears of events any more, the run has ended and is told of the first failure by a flush.
             if let Some(event) = event {
                 let _ = self.events.send(event.into()).await;
@@ -312,7 +316,19 @@ impl Recorder {
         }
     }
 
+    /// The failure, where what has to be safe before never will be.
+    async fn unsafe_on_disk(&self, instance: InstanceId, safe: Option<Mark>) -> Option<Event> {
+        self.waiting.set(WaitsFor::Disk);
+        let is_safe = match safe {
+            Some(safe) => safe.safe().await,
+            None => true,
+        };
+        let reason = || "the event log, which says what has happened, cannot be made safe on its disk".to_owned();
+        (!is_safe).then(|| Event::RetirementFailed { instance, reason: reason(), unmade: Unmade::Untried })
+    }
+
     async fn commit(&self, instance: InstanceId, commit: Commit, untouched: Option<Untouched>) -> Option<Event> {
+        self.waiting.set(WaitsFor::WorldPool);
         let reason = match commit_next(&self.world, &self.trust, self.root.get(), commit, untouched).await {
             Ok(revision) => {
                 self.root.reached(revision);
@@ -331,12 +347,14 @@ impl Recorder {
         operations: Vec<Requirement>,
         order: &Order,
     ) -> Result<Event, Event> {
-        if let Some(refused) = unsafe_on_disk(instance, order.safe.clone()).await {
+        if let Some(refused) = self.unsafe_on_disk(instance, order.safe.clone()).await {
             return Err(refused);
         }
+        self.waiting.set(WaitsFor::Leases);
         for lease in &order.after {
             lease.cancelled().await;
         }
+        self.waiting.set(WaitsFor::ResourceManager);
         let mut units = Vec::with_capacity(operations.len());
         for (index, operation) in operations.into_iter().enumerate() {
             let request = operation_request(&self.run, instance, number, index);
@@ -438,16 +456,6 @@ impl MakingProjection {
         let mut cancelled = self.cancelled.lock().unwrap_or_else(PoisonError::into_inner);
         cancelled.remove(&(self.instance, self.attempt))
     }
-}
-
-/// The failure, where what has to be safe before never will be.
-async fn unsafe_on_disk(instance: InstanceId, safe: Option<Mark>) -> Option<Event> {
-    let is_safe = match safe {
-        Some(safe) => safe.safe().await,
-        None => true,
-    };
-    let reason = || "the event log, which says what has happened, cannot be made safe on its disk".to_owned();
-    (!is_safe).then(|| Event::RetirementFailed { instance, reason: reason(), unmade: Unmade::Untried })
 }
 
 /// What is confirmed once a record is done.

@@ -27,6 +27,7 @@ use super::shell::{Place, Urgency};
 use crate::background_runtime::BackgroundRuntime;
 use crate::messages::Messages;
 use crate::safe_on_disk::Mark;
+use crate::waits_for::Waiting as Recording;
 use acquiring::{Acquiring, Asking, Waiting};
 use anyhow::{Context, bail};
 use came_between::{CameBetween, Left};
@@ -77,8 +78,8 @@ const LONG_BESIDE_OTHERS: Duration = Duration::from_secs(2);
 const OVERDUE: i64 = i64::MAX;
 /// At the end of a run, for everything that is still being recorded or given back.
 const CLOSE_DEADLINE: Duration = Duration::from_secs(3);
-/// At the end of a run, for the leases that have to be back before something is used up or deleted: for longer than a resource manager that is away
-/// is waited for.
+/// At the end of a run, for its operations, and for the leases that have to be back before something is used up or deleted: for longer than a
+/// resource manager that is away is waited for.
 const RETURN_DEADLINE: Duration = Duration::from_secs(15);
 
 /// A holder's name has so many characters at the most, half of it the task's: the resource manager takes 128 unless told otherwise.
@@ -186,6 +187,8 @@ pub(super) struct Performer {
     records: mpsc::Sender<Record>,
     /// Performs these.
     recorder: AbortOnDropHandle<()>,
+    /// Whom it waits for.
+    recording: Recording,
     /// How far the pool's root is known.
     root: Root,
     outside: Outside,
@@ -311,6 +314,7 @@ impl Performer {
         let (records, work) = mpsc::channel(MAX_PENDING_RECORDS);
         let (cancelled, recorded) = (Cancelled::default(), Recorded::default());
         let (promises, root, trust) = (Promises::default(), Root::default(), session.trust());
+        let recording = Recording::default();
         let recorder = Recorder {
             run: run.clone(),
             world: world.clone(),
@@ -323,6 +327,7 @@ impl Performer {
             trace,
             root: root.clone(),
             promises: promises.clone(),
+            waiting: recording.clone(),
         };
         tracing::debug!(run, trace = %trace.trace_id(), "calls of this run are of one trace");
         let recorder = AbortOnDropHandle::new(tokio::spawn(trace::within(trace, recorder.work(work))));
@@ -347,6 +352,7 @@ impl Performer {
             events,
             records,
             recorder,
+            recording,
             root,
             outside: Outside::default(),
             came_between: None,
@@ -529,24 +535,26 @@ impl Performer {
             self.records.send(Record::Flush(done)).await.map_err(|_| "the recorder is gone".to_owned())?;
             recorded.await.unwrap_or_else(|_| Err("the recorder is gone".to_owned()))
         };
-        // An operation waits for the leases that go back before it, and these perhaps for a resource manager that is away.
-        let returning = if self.order.operating.is_empty() { Vec::new() } else { self.order.returning.all() };
+        // An operation waits for the leases that go back before it, and all of them perhaps for a resource manager that is away.
+        let operating = self.order.operating.all();
+        let mut before = if operating.is_empty() { Vec::new() } else { self.order.returning.all() };
+        before.extend(operating);
         let in_time = async {
-            let returned = async {
-                for lease in &returning {
-                    lease.cancelled().await;
+            let operated = async {
+                for one in &before {
+                    one.cancelled().await;
                 }
             };
             tokio::select! {
-                () = returned => {}
+                () = operated => {}
                 () = self.session.gone() => {}
                 () = tokio::time::sleep(RETURN_DEADLINE) => {}
             }
             tokio::time::sleep(CLOSE_DEADLINE).await;
         };
         let recorded = tokio::select! {
-            recorded = recording => Some(recorded),
-            () = in_time => None,
+            recorded = recording => Ok(recorded),
+            () = in_time => Err(self.recording.get()),
         };
         let giving_back = async { while self.giving_back.join_next().await.is_some() {} };
         if tokio::time::timeout(CLOSE_DEADLINE, giving_back).await.is_err() {
@@ -557,9 +565,9 @@ impl Performer {
         let _ = self.recorder.await;
         self.session.close().await;
         match recorded {
-            Some(Ok(())) => Ok(()),
-            Some(Err(reason)) => bail!("what the run did is not all recorded: {reason}"),
-            None => bail!("what the run did is not all recorded: the world pool has not answered in time"),
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(reason)) => bail!("what the run did is not all recorded: {reason}"),
+            Err(waits_for) => bail!("what the run did is not all recorded: {waits_for}"),
         }
     }
 

@@ -4,6 +4,7 @@ use super::*;
 use crate::Endpoints;
 use crate::ledger::{Began, Ledger};
 use crate::task_for_tests::{FETCH_BOXES, program};
+use crate::waits_for::WaitsFor;
 use anyhow::Context;
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
@@ -403,6 +404,35 @@ async fn an_operation_at_the_end_of_a_run_waits_for_a_manager_that_is_away_and_f
     };
     let (closed, _again) = tokio::join!(bench.performer.closed(), back);
     closed
+}
+
+#[tokio::test]
+async fn the_last_operation_of_a_run_waits_for_a_manager_that_is_away_and_the_world_pool_is_not_named()
+-> anyhow::Result<()> {
+    for comes_back in [true, false] {
+        let place = tempfile::tempdir()?;
+        let directory = RuntimeDirectory::create(place.path())?;
+        let (shutdown, ended) = manager_at(&directory);
+        let (mut bench, _robot) = with_manager_at(&directory).await?;
+        shutdown.cancel();
+        ended.await;
+        bench.performer.perform(Command::Operate { instance: InstanceId(1), operations: vec![create("Box", 1)] })?;
+        while bench.performer.recording.get() != WaitsFor::ResourceManager {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        assert!(WaitsFor::ResourceManager.to_string().starts_with("the resource manager"));
+        let back = async {
+            // For longer than the end of a run waits for what is asked of others.
+            tokio::time::sleep(CLOSE_DEADLINE + Duration::from_millis(1_500)).await;
+            comes_back.then(|| manager_at(&directory))
+        };
+        let (closed, _manager) = tokio::join!(bench.performer.closed(), back);
+        match closed {
+            Ok(()) => assert!(comes_back),
+            Err(refused) => assert!(!comes_back && !refused.to_string().contains("world pool"), "{refused}"),
+        }
+    }
+    Ok(())
 }
 
 #[tokio::test]
@@ -2366,6 +2396,7 @@ async fn a_projection_behind_a_commit_that_waits_for_the_disk_leaves_with_it_and
         world: WorldClient::new(&channels, &Endpoint::Unix(pool))?,
         resources: bench.performer.resources.clone(),
         cancelled: Cancelled::default(),
+        waiting: Recording::default(),
         done: Recorded::default(),
         events,
         trust: bench.performer.trust.clone(),
