@@ -47,33 +47,50 @@ impl Window {
         }
     }
 
-    /// Checks every wait and watched motion under way, if the world may have ended one; true if any ended.
+    /// Checks waits and watched motions under way, if the world may have ended one, until one is over; true if one was. Its consequences are
+    /// handled before the others are checked.
     pub(super) fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
         if !std::mem::take(&mut self.may_end_waits) {
             return false;
         }
-        let mut active: Vec<InstanceId> = self.dispatch.active().collect();
-        active.sort_unstable();
-        let mut any = false;
-        for id in active {
-            let Some(instance) = self.graph.get(id) else { continue };
-            match instance.node().map(|node| &node.status) {
-                Some(Status::Running(_)) if context.program.state(instance.state).is_pause() => {
-                    any |= self.ends_waiting(context, id);
-                }
-                Some(Status::Running(_)) => any |= self.ends_violated(context, id),
-                Some(Status::RunningRoutine(..)) if context.plan.state(instance.state).is_watched => {
-                    let before = context.commands.len();
-                    self.tell_routine(context, id, Event::Woken);
-                    any |= context.commands.len() > before;
-                }
-                _ => {}
-            }
-            if self.end.is_some() {
-                break;
+        for id in self.in_order_of_lines() {
+            if self.end.is_some() || self.is_over(context, id) {
+                self.may_end_waits = true;
+                return true;
             }
         }
-        any
+        false
+    }
+
+    /// The same with the changes of the root that have not been followed yet.
+    pub(super) fn ends_a_wait(&mut self, context: &mut Context<'_>) -> bool {
+        self.follow_root(context);
+        self.look_at_waits(context)
+    }
+
+    /// What is under way, in the order of the lines.
+    fn in_order_of_lines(&self) -> Vec<InstanceId> {
+        let line = |id| Some((self.graph.get(id)?.line, id));
+        let mut all: Vec<_> = self.dispatch.active().filter_map(line).collect();
+        all.sort_unstable();
+        all.into_iter().map(|(_, id)| id).collect()
+    }
+
+    /// Checks a wait, a watched motion, or a routine with such inside; true if it has ended or gone on.
+    fn is_over(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
+        let Some(instance) = self.graph.get(id) else { return false };
+        match instance.node().map(|node| &node.status) {
+            Some(Status::Running(_)) if context.program.state(instance.state).is_pause() => {
+                self.ends_waiting(context, id)
+            }
+            Some(Status::Running(_)) => self.ends_violated(context, id),
+            Some(Status::RunningRoutine(..)) if context.plan.state(instance.state).is_watched => {
+                let before = context.commands.len();
+                self.tell_routine(context, id, Event::Woken);
+                context.commands.len() > before
+            }
+            _ => false,
+        }
     }
 
     /// Ends a wait if its condition holds or its signal is kept; true if it ended.
