@@ -15,7 +15,7 @@ use crate::protocol::{Awaited, Command, Event, Note};
 use ratn_model::expression::Scope;
 use ratn_model::fact::Footprint;
 use ratn_model::id::InstanceId;
-use ratn_model::program::VIOLATED;
+use ratn_model::program::{Program, VIOLATED};
 
 impl Window {
     /// Begins a wait at its place; ends it at once if it is over.
@@ -53,7 +53,7 @@ impl Window {
         if !std::mem::take(&mut self.may_end_waits) {
             return false;
         }
-        for id in self.in_order_of_lines() {
+        for id in self.longest_waiting_first(context.program) {
             if self.end.is_some() || self.is_over(context, id) {
                 self.may_end_waits = true;
                 return true;
@@ -68,12 +68,20 @@ impl Window {
         self.look_at_waits(context)
     }
 
-    /// What is under way, in the order of the lines.
-    fn in_order_of_lines(&self) -> Vec<InstanceId> {
-        let line = |id| Some((self.graph.get(id)?.line, id));
-        let mut all: Vec<_> = self.dispatch.active().filter_map(line).collect();
+    /// What is under way: what has waited longest first, then in the order of the lines.
+    fn longest_waiting_first(&self, program: &Program) -> Vec<InstanceId> {
+        let order = |id: &InstanceId| {
+            let instance = self.graph.get(*id)?;
+            let since = match &instance.node()?.status {
+                Status::Running(held) => Some(held.since),
+                Status::RunningRoutine(routine, since) => Some(routine.waits_since(program).unwrap_or(*since)),
+                _ => None,
+            };
+            Some((since?, instance.line, *id))
+        };
+        let mut all: Vec<_> = self.dispatch.active().filter_map(|id| order(&id)).collect();
         all.sort_unstable();
-        all.into_iter().map(|(_, id)| id).collect()
+        all.into_iter().map(|(_, _, id)| id).collect()
     }
 
     /// Checks a wait, a watched motion, or a routine with such inside; true if it has ended or gone on.
