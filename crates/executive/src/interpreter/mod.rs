@@ -185,6 +185,9 @@ struct Current {
     #[serde(default)]
     has_died: bool,
     phase: Phase,
+    /// When the goal or the wait began.
+    #[serde(default)]
+    since: Timestamp,
     /// When the goal reaches its timeout.
     timeout: Option<Timestamp>,
     #[serde(with = "leases")]

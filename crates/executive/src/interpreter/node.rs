@@ -37,6 +37,7 @@ impl Interpreter {
             crashes: 0,
             has_died: false,
             phase: Phase::Held,
+            since: context.now,
             timeout: None,
             lease: None,
             projection: None,
@@ -241,6 +242,7 @@ impl Interpreter {
         }
         if let Some(current) = self.current(thread) {
             current.phase = Phase::Running;
+            current.since = context.now;
             current.timeout = timeout;
         }
         self.has_begun_something(thread);

@@ -8,7 +8,8 @@ use crate::binding;
 use crate::context::Context;
 use crate::protocol::{Awaited, Command, Note};
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::VIOLATED;
+use ratn_model::program::{Program, VIOLATED};
+use ratn_model::time::Timestamp;
 
 impl Interpreter {
     /// Goes on until all threads wait and none of these waits is over.
@@ -37,6 +38,7 @@ impl Interpreter {
         }
         if let Some(current) = self.current(thread) {
             current.phase = Phase::Running;
+            current.since = now;
             current.timeout = until;
         }
         context.note(Note::Running { instance, attempt });
@@ -54,17 +56,26 @@ impl Interpreter {
         }
     }
 
-    /// Checks waits and watched motions under way until one is over; true if one was. Its consequences are handled before the others are
-    /// checked.
+    /// Since when the wait that is under way for the longest time waits.
+    pub(crate) fn waits_since(&self, program: &Program) -> Option<Timestamp> {
+        let under_way = self.threads.values().filter_map(|thread| thread.current.as_ref());
+        let waits =
+            under_way.filter(|current| current.phase == Phase::Running && program.state(current.state).is_pause());
+        waits.map(|current| current.since).min()
+    }
+
+    /// Checks waits and watched motions under way until one is over; true if one was. What has waited longest comes first, then the first
+    /// thread. The consequences are handled before the others are checked.
     pub(super) fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
         let waits = |(thread, current): (u64, &super::Current)| {
             let state = context.program.state(current.state);
             let may_end = state.is_pause() || !state.annotations.holds.is_empty();
-            (current.phase == Phase::Running && may_end).then_some((thread, current.state))
+            (current.phase == Phase::Running && may_end).then_some((current.since, thread, current.state))
         };
         let under_way = self.threads.iter().filter_map(|(id, thread)| Some((*id, thread.current.as_ref()?)));
-        let waiting: Vec<(u64, StateId)> = under_way.filter_map(waits).collect();
-        waiting.into_iter().any(|(thread, state)| {
+        let mut waiting: Vec<(Timestamp, u64, StateId)> = under_way.filter_map(waits).collect();
+        waiting.sort_unstable();
+        waiting.into_iter().any(|(_, thread, state)| {
             if context.program.state(state).is_pause() {
                 self.ends_waiting(context, thread, state)
             } else {

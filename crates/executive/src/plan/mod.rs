@@ -148,9 +148,10 @@ impl Plan {
         let transitions = outcomes::Transitions::of(program);
         let operated = resources::operated_anywhere(program);
         let read = flows::read_anywhere(program);
-        let of = |state| StatePlan::of(&Subject::of(program, state), &transitions, &operated, &read, &mut names);
+        let crossing = crossing(program);
+        let of =
+            |state| StatePlan::of(&Subject::of(program, state), &transitions, &operated, &read, &crossing, &mut names);
         let states: Vec<StatePlan> = program.states.iter().map(of).collect();
-        let crossing = crossing(program, &states);
         let (width, buckets) = (names.numbers.len() + 2, Plan::buckets(program.horizon));
         let mut plan = Plan { states, crossing, width, buckets, names };
         for (id, kept) in improves::of(program, &plan) {
@@ -190,10 +191,11 @@ impl StatePlan {
         transitions: &outcomes::Transitions,
         operated: &BTreeSet<&str>,
         read: &BTreeSet<StateId>,
+        crossing: &Footprint,
         names: &mut Names,
     ) -> StatePlan {
         let (program, state) = (subject.program, subject.state);
-        let nature = nature::of(subject);
+        let nature = nature::of(subject, crossing);
         let may_write = footprint::may_write(subject);
         let awaited = waits::awaited(subject);
         let ends = outcomes::of(subject, transitions, nature, &awaited, names);
@@ -206,7 +208,7 @@ impl StatePlan {
         };
         let mut writes = footprint::writes(subject, &ends, may_differ.as_deref(), names);
         let (written, effects_written) = footprint::written(subject, &ends, may_differ.as_deref(), names);
-        let resources = resources::of(subject, operated, names);
+        let resources = resources::of(subject, operated, crossing, names);
         writes.extend(&resources.operated);
         writes.extend(waits.then_some(WAITS));
         // A `finally` begins when everything inside has ended, and the state is left after it.
@@ -225,7 +227,7 @@ impl StatePlan {
             is_node: subject.is_node,
             is_routine: subject.is_routine(),
             is_region: matches!(around, Some(StateKind::Concurrency { .. })),
-            imprecise: nature == NodeNature::Irreversible
+            imprecise: nature::of_parts(subject) == NodeNature::Irreversible
                 && exceptions == Exceptions::Imprecise
                 && !is_watched
                 && !is_before_finally,
@@ -340,8 +342,13 @@ impl Names {
     }
 }
 
-fn crossing(program: &Program, states: &[StatePlan]) -> Footprint {
-    if states.iter().any(|own| own.is_region && own.may_write.is_none()) {
+fn crossing(program: &Program) -> Footprint {
+    let regions = program.states.iter().flat_map(|state| match &state.kind {
+        StateKind::Concurrency { regions, .. } => regions.as_slice(),
+        _ => &[],
+    });
+    let may_write = |region: &StateId| footprint::may_write(&Subject::of(program, program.state(*region)));
+    if regions.into_iter().any(|region| may_write(region).is_none()) {
         return Footprint::Everything;
     }
     let shared = program.states.iter().flat_map(|state| &state.annotations.shared);

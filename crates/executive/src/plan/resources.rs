@@ -1,6 +1,7 @@
 //! Resources of a state: what it acquires when it starts, and what it creates, deletes or consumes when it ends.
 
 use super::{Names, NodeNature, Predicate, Subject, is_action, nature};
+use ratn_model::fact::Footprint;
 use ratn_model::program::{Origin, Program, ResourceExpr, State, WORLD_MODEL};
 use ratn_model::resource::{Quantity, ResourceClass, ResourceOperation};
 use std::collections::BTreeSet;
@@ -15,8 +16,13 @@ pub(super) struct Resources {
 }
 
 /// The resources of one state, given the kinds that any state of the program operates on.
-pub(super) fn of(subject: &Subject<'_>, operated_anywhere: &BTreeSet<&str>, names: &mut Names) -> Resources {
-    let requirements = requirements(subject);
+pub(super) fn of(
+    subject: &Subject<'_>,
+    operated_anywhere: &BTreeSet<&str>,
+    crossing: &Footprint,
+    names: &mut Names,
+) -> Resources {
+    let requirements = requirements(subject, crossing);
     let operations = operations(subject.state);
     let operated: BTreeSet<&str> = if subject.is_node {
         subject.contained.iter().flat_map(|state| operated(state)).collect()
@@ -64,8 +70,8 @@ pub(super) fn operated_anywhere(program: &Program) -> BTreeSet<&str> {
 
 /// Whether a state is in a routine that works on the actual world: a computing node there runs at its place in the program and reads the root.
 /// So the room for a projection that only its `reads` imply is not needed; the routine would hold it to its end, through all its waits.
-fn looks_at_root(subject: &Subject<'_>) -> bool {
-    let acts = |routine: &State| nature::of(&Subject::of(subject.program, routine)) != NodeNature::Computes;
+fn looks_at_root(subject: &Subject<'_>, crossing: &Footprint) -> bool {
+    let acts = |routine: &State| nature::of(&Subject::of(subject.program, routine), crossing) != NodeNature::Computes;
     let states = std::iter::once(subject.state).chain(subject.around.iter().copied());
     states.filter(|state| state.is_routine()).any(acts)
 }
@@ -77,14 +83,14 @@ fn is_implied(state: &State, line: &ResourceExpr) -> bool {
 
 /// Blocks of one state add up; blocks of nested states merge by maximum. Consumes and exists add up as they are, but only from the state itself
 /// and its parts.
-fn requirements(subject: &Subject<'_>) -> Vec<ResourceExpr> {
+fn requirements(subject: &Subject<'_>, crossing: &Footprint) -> Vec<ResourceExpr> {
     // A wait holds nothing while time passes, whatever the states around it block.
     if subject.state.is_pause() {
         return Vec::new();
     }
     let within = subject.contained.iter().map(|state| (state, true));
     let around = subject.around.iter().map(|state| (state, false));
-    let looks_at_root = looks_at_root(subject);
+    let looks_at_root = looks_at_root(subject, crossing);
     let mut merged: Vec<ResourceExpr> = Vec::new();
     for (state, is_within) in within.chain(around) {
         let mut blocked: Vec<ResourceExpr> = Vec::new();

@@ -49,7 +49,9 @@ impl Window {
 
     /// Handles the timers that are due.
     pub(super) fn fire(&mut self, context: &mut Context<'_>) {
-        while let Some(timer) = self.waits.next_due(context.now) {
+        while self.end.is_none()
+            && let Some(timer) = self.waits.next_due(&self.graph, context.now)
+        {
             match timer {
                 Timer::Retry(id) => self.waits.enqueue(&mut self.graph, id),
                 Timer::Hold(id) => {
@@ -59,14 +61,16 @@ impl Window {
                 }
                 Timer::Room(id) => self.make_way_for(context, id),
                 Timer::Timeout(id, attempt) => {
-                    let Some(instance) = self.graph.get(id) else { continue };
-                    let is_running =
-                        instance.node().is_some_and(|node| node.attempt == attempt && node.status.is_running());
-                    if !is_running {
+                    if !self.is_at(id, attempt) {
                         continue;
                     }
+                    let Some(instance) = self.graph.get(id) else { continue };
                     if context.program.state(instance.state).is_pause() {
-                        self.waited_long_enough(context, id);
+                        // What follows the end of another wait comes first.
+                        self.end = self.go_on(context);
+                        if self.end.is_none() && self.is_at(id, attempt) {
+                            self.waited_long_enough(context, id);
+                        }
                         continue;
                     }
                     let limit = context.program.state(instance.state).annotations.timeout_s.unwrap_or_default();
@@ -79,6 +83,11 @@ impl Window {
                 }
             }
         }
+    }
+
+    /// Whether this attempt of an instance is running.
+    fn is_at(&self, id: InstanceId, attempt: u32) -> bool {
+        self.graph.node(id).is_some_and(|node| node.attempt == attempt && node.status.is_running())
     }
 
     /// A goal has ended: finishes the node with its result, unless it is tried again.

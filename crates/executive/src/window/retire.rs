@@ -5,7 +5,7 @@
 //! state, and the end of a region, wait for such PIAs inside.
 
 use super::Window;
-use super::graph::instance::{Changed, Ended, Instance, Node, Role, Status};
+use super::graph::instance::{Changed, Ended, Instance, LineId, Node, Role, Status};
 use super::growth::Departure;
 use super::memory::{Difference, Source, User};
 use super::waits::Wait;
@@ -47,31 +47,88 @@ struct News {
     is_open: bool,
 }
 
+/// Whether a head ends something that began before: the sequential program follows all ends, then looks at waits, and only then begins
+/// states.
+fn is_end(role: Option<Role>) -> bool {
+    matches!(role, Some(Role::Exit | Role::Test | Role::RegionEnd | Role::Join | Role::End))
+}
+
 impl Window {
-    /// Retires everything that can retire; true if anything did.
+    /// Retires everything that can retire; true if anything did. All lines come up to their next node before a node retires: in the sequential
+    /// program a node that begins now ends later, when the other regions have gone on, too.
     pub(super) fn retire(&mut self, context: &mut Context<'_>) -> bool {
+        let mut retired = false;
+        loop {
+            while self.retire_lines(context, Window::come_to_node) {
+                retired = true;
+            }
+            if !self.retire_lines(context, Window::retire_node) {
+                return retired;
+            }
+            retired = true;
+        }
+    }
+
+    /// Lets one line after the other retire something; true if any did.
+    fn retire_lines(
+        &mut self,
+        context: &mut Context<'_>,
+        retires: fn(&mut Window, &mut Context<'_>, LineId) -> bool,
+    ) -> bool {
         let mut retired = false;
         let mut last = None;
         while let Some(line) = self.graph.next_active_line(last) {
             last = Some(line);
-            while self.end.is_none() {
-                // A decision that depends on facts changed by another region must be made again before it retires.
-                retired |= self.tell_of_crossings(context);
-                let Some(id) = self.graph.head_of(line) else { break };
-                if self.passes(context, id) {
-                    self.graph.pass_over(id);
-                    retired = true;
-                    continue;
-                }
-                self.come_to_its_place(context, id);
-                let has_ended = self.graph.get(id).is_some_and(|head| head.ended().is_some());
-                if !has_ended || !self.retire_head(context, id) {
-                    break;
-                }
-                retired = true;
-            }
+            retired |= retires(self, context, line);
         }
         retired
+    }
+
+    /// Retires what comes before the next node of a line; true if there was anything.
+    fn come_to_node(&mut self, context: &mut Context<'_>, line: LineId) -> bool {
+        let mut retired = false;
+        while self.end.is_none() {
+            // A decision that depends on facts changed by another region must be made again before it retires.
+            retired |= self.tell_of_crossings(context);
+            let Some(head) = self.graph.head_of(line).and_then(|id| self.graph.get(id)) else { break };
+            let (id, role, has_ended) = (head.id, head.role(), head.ended().is_some());
+            if !is_end(role) && self.ends_a_wait(context) {
+                retired = true;
+                continue;
+            }
+            // The sequential program goes on here before it goes on in the next region.
+            if self.waits.takes(&mut self.graph, id) {
+                self.examine(context, id);
+                continue;
+            }
+            if role.is_none() {
+                self.come_to_its_place(context, id);
+                break;
+            }
+            if !has_ended || !self.retire_head(context, id) {
+                break;
+            }
+            retired = true;
+        }
+        retired
+    }
+
+    /// Retires the head of a line, or passes it over, if it is a node; true if it did.
+    fn retire_node(&mut self, context: &mut Context<'_>, line: LineId) -> bool {
+        if self.end.is_some() {
+            return false;
+        }
+        let told = self.tell_of_crossings(context);
+        let Some(head) = self.graph.head_of(line).and_then(|id| self.graph.get(id)) else { return told };
+        let (id, has_ended) = (head.id, head.ended().is_some());
+        if head.role().is_some() {
+            return told;
+        }
+        if self.passes(context, id) {
+            self.graph.pass_over(id);
+            return true;
+        }
+        (has_ended && self.retire_head(context, id)) || told
     }
 
     /// Whether the head is an imprecise PIA that runs and may be passed over, because only one way on, that of its success, is computed ahead.

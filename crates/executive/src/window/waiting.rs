@@ -15,7 +15,7 @@ use crate::protocol::{Awaited, Command, Event, Note};
 use ratn_model::expression::Scope;
 use ratn_model::fact::Footprint;
 use ratn_model::id::InstanceId;
-use ratn_model::program::VIOLATED;
+use ratn_model::program::{Program, VIOLATED};
 
 impl Window {
     /// Begins a wait at its place; ends it at once if it is over.
@@ -47,33 +47,58 @@ impl Window {
         }
     }
 
-    /// Checks every wait and watched motion under way, if the world may have ended one; true if any ended.
+    /// Checks waits and watched motions under way, if the world may have ended one, until one is over; true if one was. Its consequences are
+    /// handled before the others are checked.
     pub(super) fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
         if !std::mem::take(&mut self.may_end_waits) {
             return false;
         }
-        let mut active: Vec<InstanceId> = self.dispatch.active().collect();
-        active.sort_unstable();
-        let mut any = false;
-        for id in active {
-            let Some(instance) = self.graph.get(id) else { continue };
-            match instance.node().map(|node| &node.status) {
-                Some(Status::Running(_)) if context.program.state(instance.state).is_pause() => {
-                    any |= self.ends_waiting(context, id);
-                }
-                Some(Status::Running(_)) => any |= self.ends_violated(context, id),
-                Some(Status::RunningRoutine(..)) if context.plan.state(instance.state).is_watched => {
-                    let before = context.commands.len();
-                    self.tell_routine(context, id, Event::Woken);
-                    any |= context.commands.len() > before;
-                }
-                _ => {}
-            }
-            if self.end.is_some() {
-                break;
+        for id in self.longest_waiting_first(context.program) {
+            if self.end.is_some() || self.is_over(context, id) {
+                self.may_end_waits = true;
+                return true;
             }
         }
-        any
+        false
+    }
+
+    /// The same with the changes of the root that have not been followed yet.
+    pub(super) fn ends_a_wait(&mut self, context: &mut Context<'_>) -> bool {
+        self.follow_root(context);
+        self.look_at_waits(context)
+    }
+
+    /// What is under way: what has waited longest first, then in the order of the lines.
+    fn longest_waiting_first(&self, program: &Program) -> Vec<InstanceId> {
+        let order = |id: &InstanceId| {
+            let instance = self.graph.get(*id)?;
+            let since = match &instance.node()?.status {
+                Status::Running(held) => Some(held.since),
+                Status::RunningRoutine(routine, since) => Some(routine.waits_since(program).unwrap_or(*since)),
+                _ => None,
+            };
+            Some((since?, instance.line, *id))
+        };
+        let mut all: Vec<_> = self.dispatch.active().filter_map(|id| order(&id)).collect();
+        all.sort_unstable();
+        all.into_iter().map(|(_, _, id)| id).collect()
+    }
+
+    /// Checks a wait, a watched motion, or a routine with such inside; true if it has ended or gone on.
+    fn is_over(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
+        let Some(instance) = self.graph.get(id) else { return false };
+        match instance.node().map(|node| &node.status) {
+            Some(Status::Running(_)) if context.program.state(instance.state).is_pause() => {
+                self.ends_waiting(context, id)
+            }
+            Some(Status::Running(_)) => self.ends_violated(context, id),
+            Some(Status::RunningRoutine(..)) if context.plan.state(instance.state).is_watched => {
+                let before = context.commands.len();
+                self.tell_routine(context, id, Event::Woken);
+                context.commands.len() > before
+            }
+            _ => false,
+        }
     }
 
     /// Ends a wait if its condition holds or its signal is kept; true if it ended.

@@ -201,6 +201,17 @@ impl Waits {
         None
     }
 
+    /// Takes an instance out of the queue, to be examined now; false if it is not in the queue.
+    pub(crate) fn takes(&mut self, graph: &mut Graph, id: InstanceId) -> bool {
+        for touched in graph.take_touched() {
+            self.enqueue(graph, touched);
+        }
+        let Some(cell) = graph.waiting(id).filter(|cell| cell.is_queued) else { return false };
+        cell.is_queued = false;
+        self.queue.retain(|queued| *queued != id);
+        true
+    }
+
     /// The environment has changed: instances that wait for that are examined.
     pub(crate) fn environment_changed(&mut self, graph: &mut Graph) {
         for id in std::mem::take(&mut self.for_environment) {
@@ -226,13 +237,19 @@ impl Waits {
         self.timers.insert((at, timer));
     }
 
-    /// The next timer that is due.
-    pub(crate) fn next_due(&mut self, now: Timestamp) -> Option<Timer> {
-        let (at, _) = self.timers.first()?;
-        if *at > now {
-            return None;
-        }
-        self.timers.pop_first().map(|(_, timer)| timer)
+    /// The next timer that is due; among timeouts of one moment the one on the first line.
+    pub(crate) fn next_due(&mut self, graph: &Graph, now: Timestamp) -> Option<Timer> {
+        let first = *self.timers.first().filter(|(at, _)| *at <= now)?;
+        let alike = self.timers.iter().take_while(|(at, timer)| {
+            *at == first.0 && std::mem::discriminant(timer) == std::mem::discriminant(&first.1)
+        });
+        let line = |timer: &Timer| match timer {
+            Timer::Timeout(id, _) => graph.get(*id).map(|instance| instance.line),
+            _ => None,
+        };
+        let next = *alike.min_by_key(|(_, timer)| line(timer))?;
+        self.timers.remove(&next);
+        Some(next.1)
     }
 
     /// Checks, when the queue is empty, that every waiting instance is registered with the one that it waits for.
