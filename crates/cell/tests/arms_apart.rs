@@ -517,3 +517,26 @@ fn beside_an_arm_that_stands_nearby_fingers_and_their_arm_move_one_after_the_oth
         assert_eq!(bench.cell.unintended_contacts(), []);
     }
 }
+
+#[test]
+fn no_picture_is_taken_while_an_arm_moves_that_carries_the_camera() {
+    // One arm alone hangs from the torso, and the camera with it.
+    let (mut bench, _folder) = with_head("left_2");
+    starts(&mut bench, LEFT, to([0.0, 0.7, 0.0], 0.5));
+    let reason = refused(&mut bench, LEFT, Request::Capture { frames: 1 });
+    assert!(reason.contains("Arm of the arm `left` is under way") && reason.contains("carries the camera"), "{reason}");
+    bench.pass(60.0);
+    starts(&mut bench, LEFT, Request::Capture { frames: 10 });
+    for way in [to([0.0, 0.5, 0.0], 0.5), follow(&bench, LEFT, [0.0, 0.5, 0.0])] {
+        let reason = refused(&mut bench, LEFT, way);
+        assert!(reason.contains("Camera is under way") && reason.contains("carries the camera"), "{reason}");
+    }
+    starts(&mut bench, RIGHT, to([0.0, -0.5, 0.1], 0.5));
+}
+
+/// A trajectory of an arm from where it is.
+fn follow(bench: &Bench, arm: usize, there: [f64; 3]) -> Request {
+    let way = vec![bench.cell.measured_of(arm).arm, JointVector::of(there)];
+    let trajectory = parameterise(bench.cell.robot_of(arm), &[Section::AsGiven(way)], 1.0, &mut |_, _| false);
+    Request::Follow { trajectory }
+}

@@ -32,6 +32,7 @@ const HAND: &str = "an arm does not move while its fingers close, nor before the
                     states block `Arm` and `Gripper`";
 const PICTURE: &str =
     "no picture is taken while the head moves, so let one of both states block `PanTilt` and `Camera`";
+const CARRIED: &str = "no picture is taken while an arm moves that carries the camera, so let one of both states block `Arm` and `Camera`";
 
 impl Cell {
     /// Starts a goal, of the arm of this number where it is one for an arm or its gripper.
@@ -110,6 +111,8 @@ impl Cell {
             Request::Capture { frames } => {
                 self.no_motion_of(Module::Base, BASE)?;
                 self.no_motion_of(Module::PanTilt, PICTURE)?;
+                let mut carriers = self.arms.numbers().filter(|arm| self.robot.moves_camera(*arm));
+                carriers.try_for_each(|arm| self.no_motion_of(Module::Arm(arm), CARRIED))?;
                 if !(1..=MAX_FRAMES).contains(&frames) {
                     return Err(format!("a picture has 1 to {MAX_FRAMES} frames, not {frames}"));
                 }
@@ -133,9 +136,12 @@ impl Cell {
         Ok(())
     }
 
-    /// What does not move while an arm does: of its own fingers those that close, and those that have not parted yet from what they let go.
+    /// What does not happen while an arm moves: pictures of a camera that it carries, and of its own fingers those that close, and those that have not parted yet from what they let go.
     fn may_move_arm(&self, arm: usize) -> Result<(), String> {
         self.no_motion_of(Module::Base, BASE)?;
+        if self.robot.moves_camera(arm) {
+            self.no_motion_of(Module::Camera, CARRIED)?;
+        }
         let finger = self.arms.seen_from(arm, &self.measured()).finger;
         let parted = self.arms.closed(arm).has_parted(finger, self.arms.open_finger_m(arm));
         if parted && self.opens_fingers_to(arm).is_some() {
