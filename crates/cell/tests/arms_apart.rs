@@ -540,3 +540,22 @@ fn follow(bench: &Bench, arm: usize, there: [f64; 3]) -> Request {
     let trajectory = parameterise(bench.cell.robot_of(arm), &[Section::AsGiven(way)], 1.0, &mut |_, _| false);
     Request::Follow { trajectory }
 }
+
+#[test]
+fn fingers_do_not_pass_through_a_link_of_their_own_robot_however_thin_both_are() {
+    for thick in [0.002, 0.003, 0.004, 0.01] {
+        let post = "<link name='post'><collision><geometry><box size='0.01 0.002 0.06'/></geometry></collision></link>\
+                    <joint name='post' type='fixed'><parent link='world'/><child link='post'/><origin xyz='0 0.422 1.42'/></joint></robot>";
+        let folder = tempfile::tempdir().unwrap();
+        let config = config(folder.path(), &description());
+        let middle = thick / 2.0;
+        let thin = urdf()
+            .replace("0 0.005 -0.06", &format!("0 {middle} -0.06"))
+            .replace("0 -0.005 -0.06", &format!("0 -{middle} -0.06"))
+            .replace("0.02 0.01 0.08", &format!("0.02 {thick} 0.08"));
+        std::fs::write(folder.path().join("gantry.urdf"), thin.replace("</robot>", post)).unwrap();
+        let mut bench = Bench::of(config);
+        let reason = refused(&mut bench, LEFT, close());
+        assert!(reason.contains("while its fingers close") && reason.contains("link post"), "{thick}: {reason}");
+    }
+}
