@@ -1,7 +1,7 @@
 //! What an arm and its fingers meet where both move, each in its own time: any place of the fingers comes with any posture of the arm.
 //!
 //! Looked at are stretches of the arm's way with stretches of the fingers'. In the middle of both, where there is more room than anything moves
-//! from there within them, they are free; else the one by which things move further is halved, until nothing moves by more than [`RESOLUTION_M`].
+//! from there within them, they are free; else the one by which things move further is halved, until nothing moves by more than half a millimetre.
 //! That is the check of a trajectory (`validate`) with the fingers as one more joint, so nothing is too thin to be seen.
 
 use crate::collision::{Checker, Collision, Contact, between};
