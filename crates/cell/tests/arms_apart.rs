@@ -517,3 +517,45 @@ fn beside_an_arm_that_stands_nearby_fingers_and_their_arm_move_one_after_the_oth
         assert_eq!(bench.cell.unintended_contacts(), []);
     }
 }
+
+#[test]
+fn no_picture_is_taken_while_an_arm_moves_that_carries_the_camera() {
+    // One arm alone hangs from the torso, and the camera with it.
+    let (mut bench, _folder) = with_head("left_2");
+    starts(&mut bench, LEFT, to([0.0, 0.7, 0.0], 0.5));
+    let reason = refused(&mut bench, LEFT, Request::Capture { frames: 1 });
+    assert!(reason.contains("Arm of the arm `left` is under way") && reason.contains("carries the camera"), "{reason}");
+    bench.pass(60.0);
+    starts(&mut bench, LEFT, Request::Capture { frames: 10 });
+    for way in [to([0.0, 0.5, 0.0], 0.5), follow(&bench, LEFT, [0.0, 0.5, 0.0])] {
+        let reason = refused(&mut bench, LEFT, way);
+        assert!(reason.contains("Camera is under way") && reason.contains("carries the camera"), "{reason}");
+    }
+    starts(&mut bench, RIGHT, to([0.0, -0.5, 0.1], 0.5));
+}
+
+/// A trajectory of an arm from where it is.
+fn follow(bench: &Bench, arm: usize, there: [f64; 3]) -> Request {
+    let way = vec![bench.cell.measured_of(arm).arm, JointVector::of(there)];
+    let trajectory = parameterise(bench.cell.robot_of(arm), &[Section::AsGiven(way)], 1.0, &mut |_, _| false);
+    Request::Follow { trajectory }
+}
+
+#[test]
+fn fingers_do_not_pass_through_a_link_of_their_own_robot_however_thin_both_are() {
+    for thick in [0.002, 0.003, 0.004, 0.01] {
+        let post = "<link name='post'><collision><geometry><box size='0.01 0.002 0.06'/></geometry></collision></link>\
+                    <joint name='post' type='fixed'><parent link='world'/><child link='post'/><origin xyz='0 0.422 1.42'/></joint></robot>";
+        let folder = tempfile::tempdir().unwrap();
+        let config = config(folder.path(), &description());
+        let middle = thick / 2.0;
+        let thin = urdf()
+            .replace("0 0.005 -0.06", &format!("0 {middle} -0.06"))
+            .replace("0 -0.005 -0.06", &format!("0 -{middle} -0.06"))
+            .replace("0.02 0.01 0.08", &format!("0.02 {thick} 0.08"));
+        std::fs::write(folder.path().join("gantry.urdf"), thin.replace("</robot>", post)).unwrap();
+        let mut bench = Bench::of(config);
+        let reason = refused(&mut bench, LEFT, close());
+        assert!(reason.contains("while its fingers close") && reason.contains("link post"), "{thick}: {reason}");
+    }
+}

@@ -391,6 +391,33 @@ impl<'a> Checker<'a> {
         ((moved / step).ceil() as usize).max(1)
     }
 
+    /// The same but for two shapes that meet, by their names: they may.
+    pub(crate) fn but_for(mut self, met: &Collision) -> Checker<'a> {
+        let is_met = |a: &str, b: &str| [[a, b], [b, a]].contains(&[&*met.moving, &*met.other]);
+        let (moving, obstacles) = (&mut self.moving, &self.obstacles);
+        for one in moving.iter_mut() {
+            let name = one.name.clone();
+            one.obstacles.retain(|o| !is_met(&name, &obstacles[*o].name));
+        }
+        self.pairs.retain(|(i, j)| !is_met(&moving[*i].name, &moving[*j].name));
+        self
+    }
+
+    /// From now on each finger is so far from the middle, in metres.
+    pub(crate) fn set_finger(&mut self, finger: f64) {
+        if self.configuration.finger != finger {
+            self.configuration.finger = finger;
+            self.find_reach();
+        }
+    }
+
+    /// How far any point of the fingers moves, or two of them move towards each other, at the most when each goes so far, in metres.
+    pub(crate) fn fingers_move_m(&self, by: f64) -> f64 {
+        let farthest =
+            self.farthest(self.robot.finger_joints(), |link| self.robot.finger_chain(&self.configuration, link));
+        farthest.iter().map(|reach| reach * by.abs()).sum()
+    }
+
     /// Whether a posture touches nothing.
     pub fn is_free(&mut self, arm: &JointVector, contact: Contact) -> bool {
         self.hit(arm, contact).is_none()

@@ -30,6 +30,7 @@ mod elbow;
 mod ellipsoid;
 mod endless;
 pub mod exact;
+pub mod fingers_meanwhile;
 mod frame;
 pub mod geometry;
 pub mod hands;

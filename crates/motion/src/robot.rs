@@ -466,6 +466,18 @@ impl Robot {
         Chain::to(link, &self.model.links, |link| link.moved_by(&self.arm.indices, &positions))
     }
 
+    /// The same with the joints that move the fingers.
+    pub(crate) fn finger_chain(&self, configuration: &Configuration, link: usize) -> Chain {
+        let positions = self.positions(configuration);
+        let indices: &[usize] = self.finger.as_ref().map_or(&[], |finger| &finger.indices);
+        Chain::to(link, &self.model.links, |link| link.moved_by(indices, &positions))
+    }
+
+    /// The limits of what moves the fingers; none of a robot without a gripper.
+    pub(crate) fn finger_joints(&self) -> &[Joint] {
+        self.finger.as_ref().map_or(&[], |finger| &finger.joints)
+    }
+
     /// The limits of the arm's joints.
     pub fn arm_joints(&self) -> &[Joint] {
         &self.arm.joints

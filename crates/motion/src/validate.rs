@@ -20,7 +20,7 @@ const LIMIT_TOLERANCE: f64 = 0.01;
 const POSITION_TOLERANCE: f64 = 1e-3;
 
 /// What is touched by less than this may go unseen, in metres.
-const RESOLUTION_M: f64 = 5e-4;
+pub(crate) const RESOLUTION_M: f64 = 5e-4;
 
 /// Why a trajectory may not be followed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

@@ -12,14 +12,16 @@ use super::cell::Cell;
 use super::clearance::{Ahead, Crossing, MAX_POSTURES, Other, Part, keep_apart};
 use super::levers::{Levers, Thinned};
 use ratn_model::pose::Pose;
-use ratn_motion::collision::{Checker, Collision, Contact};
+use ratn_motion::collision::Checker;
+use ratn_motion::fingers_meanwhile::{TooLong, met_on_the_way};
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{ArmPosition, Configuration};
 use ratn_world::scene::Scene;
 
 /// Maximum distance between two finger positions that are compared, in metres.
 const FINGER_STEP_M: f64 = 0.002;
-/// The same where every finger position is combined with every posture of the moving joints. Every finger is thicker than this.
+/// The same where the arm moves meanwhile, beside another part on its way: every position of the fingers comes with every one of the joints. Half
+/// of it is kept besides.
 const OPENING_STEP_M: f64 = 0.008;
 /// Maximum number of combined finger positions and joint postures compared with a standing part at the fine step; beyond it, the coarse step is used.
 const MAX_POSTURES_BESIDE: usize = 10 * MAX_POSTURES;
@@ -153,38 +155,17 @@ impl Cell {
         let robot = self.arms.view(arm);
         let nothing = Scene { base: Pose::IDENTITY, objects: Vec::new() };
         let at = self.arms.seen_from(arm, &self.measured());
-        let checker = |finger: f64| {
-            let mut there: Configuration = at;
-            there.finger = finger;
-            Checker::new(robot, &nothing, &there, 0.0)
-        };
-        let mut first = checker(from);
-        let meets_already = joints.first().and_then(|posture| first.collision(posture, Contact::None));
-        // No link moves farther in one step than in a step of the checker, and the last posture is always checked.
-        let mut way: Vec<&JointVector> = Vec::new();
-        for (i, posture) in joints.iter().enumerate() {
-            let next = joints.get(i + 1);
-            if next.is_none_or(|next| way.last().is_none_or(|before| first.steps(before, next) > 1)) {
-                way.push(posture);
-            }
-        }
-        let fingers: Vec<f64> = passed(from, to, OPENING_STEP_M).collect();
-        if fingers.len() * way.len() > MAX_POSTURES {
-            return Err(format!(
-                "{near}: arm and fingers move too far at once to be checked: move one after the other"
-            ));
-        }
-        // Between two finger positions the fingers move by less than their thickness, so nothing is skipped.
-        for finger in fingers {
-            let mut checker = checker(finger);
-            let met = way.iter().find_map(|posture| checker.collision(posture, Contact::None));
-            let pair = |met: &Collision| [met.moving.clone(), met.other.clone()];
-            if let Some(met) = met.filter(|met| meets_already.as_ref().map(pair) != Some(pair(met))) {
+        let checker = Checker::new(robot, &nothing, &Configuration { finger: from, ..at }, 0.0);
+        match met_on_the_way(checker, joints, [from, to], MAX_POSTURES) {
+            Ok(None) => Ok(()),
+            Ok(Some(met)) => {
                 let go = if to > from { "open" } else { "close" };
-                return Err(format!("{near}: while its fingers {go}, {met}"));
+                Err(format!("{near}: while its fingers {go}, {met}"))
+            }
+            Err(TooLong) => {
+                Err(format!("{near}: arm and fingers move too far at once to be checked: move one after the other"))
             }
         }
-        Ok(())
     }
 
     /// Whether the head may turn between these positions of pan and tilt, in radians.

@@ -32,6 +32,7 @@ const HAND: &str = "an arm does not move while its fingers close, nor before the
                     states block `Arm` and `Gripper`";
 const PICTURE: &str =
     "no picture is taken while the head moves, so let one of both states block `PanTilt` and `Camera`";
+const CARRIED: &str = "no picture is taken while an arm moves that carries the camera, so let one of both states block `Arm` and `Camera`";
 
 impl Cell {
     /// Starts a goal; `arm` is the arm's number, if it is for an arm or its gripper.
@@ -110,6 +111,8 @@ impl Cell {
             Request::Capture { frames } => {
                 self.no_motion_of(Module::Base, BASE)?;
                 self.no_motion_of(Module::PanTilt, PICTURE)?;
+                let mut carriers = self.arms.numbers().filter(|arm| self.robot.moves_camera(*arm));
+                carriers.try_for_each(|arm| self.no_motion_of(Module::Arm(arm), CARRIED))?;
                 if !(1..=MAX_FRAMES).contains(&frames) {
                     return Err(format!("a picture has 1 to {MAX_FRAMES} frames, not {frames}"));
                 }
@@ -133,10 +136,13 @@ impl Cell {
         Ok(())
     }
 
-    /// Checks that nothing moves that has to stand while an arm moves: the base, and the arm's fingers while they close or have not separated from a
-    /// released object.
+    /// Checks that nothing happens that has to wait while an arm moves: the base moves, a camera that the arm carries takes a picture, or the
+    /// arm's own fingers close or have not separated from a released object.
     fn may_move_arm(&self, arm: usize) -> Result<(), String> {
         self.no_motion_of(Module::Base, BASE)?;
+        if self.robot.moves_camera(arm) {
+            self.no_motion_of(Module::Camera, CARRIED)?;
+        }
         let finger = self.arms.seen_from(arm, &self.measured()).finger;
         let parted = self.arms.closed(arm).has_parted(finger, self.arms.open_finger_m(arm));
         if parted && self.opens_fingers_to(arm).is_some() {

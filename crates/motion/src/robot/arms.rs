@@ -158,6 +158,11 @@ impl Robot {
         }
     }
 
+    /// Whether the joints of the arm with this number move the camera.
+    pub fn moves_camera(&self, arm: usize) -> bool {
+        self.camera.is_some_and(|camera| self.links_of(arm).contains(&camera))
+    }
+
     /// The links of the fingers of the arm with this number.
     pub fn finger_links_of(&self, arm: usize) -> Vec<usize> {
         match arm.checked_sub(1) {

@@ -1,0 +1,88 @@
+//! What an arm and its fingers meet where both move, each in its own time: any place of the fingers comes with any posture of the arm.
+//!
+//! Looked at are stretches of the arm's way with stretches of the fingers'. In the middle of both, where there is more room than anything moves
+//! from there within them, they are free; else the one by which things move further is halved, until nothing moves by more than half a millimetre.
+//! That is the check of a trajectory (`validate`) with the fingers as one more joint, so nothing is too thin to be seen.
+
+use crate::collision::{Checker, Collision, Contact, between};
+use crate::joint_vector::JointVector;
+use crate::validate::RESOLUTION_M;
+
+/// So many looks were not enough.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TooLong;
+
+/// Postures of an arm with places of its fingers.
+#[derive(Debug, Clone, Copy)]
+struct Stretch {
+    /// From and to: a whole number is a posture of the way, between two of them the way is straight.
+    way: [f64; 2],
+    /// From and to this distance from the middle.
+    fingers: [f64; 2],
+}
+
+/// The first thing found that a robot meets while its arm takes the way through these postures and its fingers go from and to these distances from the
+/// middle, in metres. What meets where both begin may. `checker` is one without padding.
+///
+/// # Errors
+/// Where it is not found out by `most` looks.
+pub fn met_on_the_way(
+    mut checker: Checker<'_>,
+    postures: &[JointVector],
+    fingers: [f64; 2],
+    most: usize,
+) -> Result<Option<Collision>, TooLong> {
+    let Some(last) = postures.len().checked_sub(1) else { return Ok(None) };
+    checker.set_finger(fingers[0]);
+    while let Some(met) = checker.collision(&postures[0], Contact::None) {
+        checker = checker.but_for(&met);
+    }
+    let mut stretches = vec![Stretch { way: [0.0, last as f64], fingers }];
+    for _ in 0..most {
+        let Some(stretch) = stretches.pop() else { return Ok(None) };
+        let (posture, finger) = (at(postures, middle(stretch.way)), middle(stretch.fingers));
+        checker.set_finger(finger);
+        let by_arm_m = checker.moves_m(&strays(postures, stretch.way, &posture));
+        let by_fingers_m = checker.fingers_move_m(stretch.fingers[1] - finger);
+        let moves_m = by_arm_m + by_fingers_m;
+        let room = match checker.room(&posture, Contact::None, moves_m) {
+            Ok(room) => room,
+            Err(met) => return Ok(Some(met)),
+        };
+        if room < moves_m && moves_m > RESOLUTION_M {
+            stretches.extend(if by_fingers_m > by_arm_m {
+                halves(stretch.fingers).map(|fingers| Stretch { fingers, ..stretch })
+            } else {
+                halves(stretch.way).map(|way| Stretch { way, ..stretch })
+            });
+        }
+    }
+    if stretches.is_empty() { Ok(None) } else { Err(TooLong) }
+}
+
+fn middle([from, to]: [f64; 2]) -> f64 {
+    (from + to) / 2.0
+}
+
+/// The first half is taken first.
+fn halves(whole: [f64; 2]) -> [[f64; 2]; 2] {
+    [[middle(whole), whole[1]], [whole[0], middle(whole)]]
+}
+
+/// The posture at a place of the way.
+fn at(postures: &[JointVector], place: f64) -> JointVector {
+    let before = place.floor() as usize;
+    match postures.get(before + 1) {
+        Some(next) => between(&postures[before], next, place.fract()),
+        None => postures[before],
+    }
+}
+
+/// How far each joint is at the most from where it is in a posture, on a part of the way.
+fn strays(postures: &[JointVector], [from, to]: [f64; 2], posture: &JointVector) -> JointVector {
+    let within = &postures[from.ceil() as usize..=to.floor() as usize];
+    let ends = [at(postures, from), at(postures, to)];
+    ends.iter().chain(within).fold(JointVector::zeros(posture.len()), |most, other| {
+        JointVector::from_fn(posture.len(), |j| most[j].max((other[j] - posture[j]).abs()))
+    })
+}
