@@ -52,7 +52,8 @@ fn told(update: &ResourceUpdate, lease: &Lease) -> Option<String> {
                     Some(match event.reason.as_str() {
                         // Released by its own session, or by an operator.
                         "asked" | "revoked" => format!("lease {number} was released by another"),
-                        "the resource is gone" => format!("`{id}` was deleted"),
+                        // A lease ends with the first resource that it loses; of several this need not be the one that was deleted.
+                        "a resource of it is gone" if lease.resources.len() == 1 => format!("`{id}` was deleted"),
                         reason => format!("lease {number} ended: {reason}"),
                     })
                 }
