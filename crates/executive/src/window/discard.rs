@@ -100,8 +100,8 @@ impl Window {
         }
     }
 
-    /// Cancels what says of itself what being cut short changes, in the order of threads of control, as the sequential program does. Of one thread
-    /// the oldest comes last, because only that one is at its place in the sequential program.
+    /// Cancels running routines, and running nodes that declare effects for `preempted`, in the order of threads of control, as the sequential
+    /// program does. Within a thread the oldest comes last, because only that one is at its place in the sequential program.
     fn say_what_is_cut_short(&mut self, context: &mut Context<'_>) {
         let declares = |instance: &Instance| {
             let declared = context.program.state(instance.state).annotations.effects.get(PREEMPTED);
