@@ -139,7 +139,7 @@ pub(super) enum Answer {
     },
     /// A revision of the root, by this run or another.
     World(WorldChange),
-    /// Another run waits for what these leases hold, and needs it for certain.
+    /// Another run waits for the resources of these leases, and certainly needs them.
     Wanted(Vec<LeaseId>),
 }
 
@@ -215,9 +215,9 @@ pub(super) struct Performer {
     waiting_since: BTreeMap<InstanceId, (Instant, LastAsked)>,
     leases: Leases,
     holds: HoldsSpeculatively,
-    /// What the instances of the window are called, for whoever asks who holds something.
+    /// The paths of the instances in the window, to name the holders of leases.
     paths: BTreeMap<InstanceId, String>,
-    /// Of the commands that are performed now.
+    /// The handover by the present commands.
     handover: Option<Handover>,
     jobs: BTreeMap<InstanceId, Job>,
     stopping: Stopping,

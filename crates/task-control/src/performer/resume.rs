@@ -323,8 +323,8 @@ impl Performer {
         Ok(operations)
     }
 
-    /// Of what was lost before it was committed, and of what nobody waits for any more: where others have changed since what that changes or is made of,
-    /// it is not true any more.
+    /// Refuses to resume if others have changed facts that a missing commit changes or is based on. Checks commits whose leases were lost before they
+    /// were made, and commits for which nobody waits any more.
     async fn refuse_what_came_between(
         &self,
         program: &Program,
