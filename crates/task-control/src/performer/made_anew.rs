@@ -74,7 +74,8 @@ impl Performer {
         Ok(renamed)
     }
 
-    /// Uses up again what the run had used up and what has returned, of the same resources. If a resource has gone since, its consumption has gone with it.
+    /// Uses up again, of the same resources, what the run had used up of units that have returned and of resources that exist again. If a resource has
+    /// gone since, its consumption has gone with it.
     async fn use_up_anew(&self, account: &Account, renamed: &Renamed) -> anyhow::Result<()> {
         for (index, (resource, UsedUp { kind, units })) in account.used_up().enumerate() {
             let resource = renamed.get(resource).map_or(resource, String::as_str);
