@@ -112,7 +112,7 @@ struct Search<'a> {
 type Candidates<'a> = Box<dyn Iterator<Item = (Slot, &'a Resource)> + 'a>;
 
 impl<'a> Search<'a> {
-    /// Each requirement takes what is there, in order.
+    /// Each requirement takes what is available, in order.
     fn greedy(&mut self, requirements: &[&Requirement]) {
         let class_of = |index: usize| self.classes.iter().position(|class| class.members.contains(&index));
         let classes: Vec<Option<usize>> = (0..requirements.len()).map(class_of).collect();

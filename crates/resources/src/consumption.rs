@@ -1,4 +1,4 @@
-//! Consume, and the end of a task, which gives back what is renewable.
+//! Consume, and the end of a task, which returns renewable units.
 
 use crate::assignment::{Assignment, Available};
 use crate::error::PoolError;

@@ -143,8 +143,8 @@ impl Window {
         }
     }
 
-    /// The instances at which the sequential program would be, one per thread of control: the oldest ones that are not real. Of a line that is
-    /// expanded past a running imprecise PIA this is that PIA, and the regions of a younger fork have not begun there.
+    /// The instances at which the sequential program would be, one per thread of control: the oldest ones that are not real. If a line is expanded
+    /// past a running imprecise PIA, this is that PIA, and the regions of a younger fork have not begun there.
     fn places(&self) -> Vec<&Instance> {
         let detached = self.graph.detached().iter().filter_map(|id| self.graph.get(*id));
         // The sequential program has not begun a motion whose path was left.

@@ -409,7 +409,7 @@ impl Performer {
     }
 
     /// Resolves when the session with the resource manager, and with it every lease, is gone. A silent manager is waited for, also with a motion
-    /// under way: its provider holds the motion meanwhile, and a manager that was suspended still knows what the run holds.
+    /// under way: its provider keeps the robot at standstill meanwhile, and a manager that was suspended still knows what the run holds.
     pub(super) async fn lost(&self) {
         self.session.gone().await;
     }

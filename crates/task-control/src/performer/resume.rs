@@ -287,8 +287,9 @@ impl Performer {
         }
     }
 
-    /// The condition for an earlier commit, which conflicts with no change up to revision `seen`. If the run has lost its leases: others have not
-    /// changed the same facts since then. If it has not: they have not since the decision; this is checked once nobody waits for the commit any more.
+    /// The condition for an earlier commit, with which no change up to revision `seen` conflicts. If the run has lost its leases: others have not
+    /// changed the same facts since `seen`. If it has not: they have not since the decision; this is checked once nobody waits for the commit any
+    /// more.
     fn untouched(&self, program: &Arc<Program>, decided: &Decided, seen: Revision) -> Untouched {
         match decided.began.held_until {
             Some(_) => Untouched::behind(program, &self.run, seen),
@@ -361,8 +362,8 @@ impl Performer {
     }
 
     /// Repeats earlier withdrawals that may not have arrived: a lease whose grant crossed with the end of task control goes back; a waiting request
-    /// has left the queue with its connection. Only operations, and leases that nobody knows of, wait for this. The returned token is cancelled when
-    /// all of it is done.
+    /// has left the queue with its connection. Only operations, and the return of leases that nobody knows of, wait for this. The returned token is
+    /// cancelled when all of it is done.
     fn withdraw_again(&mut self, withdrawn: Vec<String>) -> CancellationToken {
         let over = CancellationToken::new();
         let ends = over.clone().drop_guard();

@@ -1098,7 +1098,7 @@ async fn of_a_named_projection_that_cannot_be_made_is_heard_afterwards() -> anyh
     let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
     let refused = world.query(Some(named), &[]).await;
     assert_eq!(refused.map_err(|error| error.reason().to_owned()).err().as_deref(), Some("PROJECTION_UNKNOWN"));
-    // A worker that waits for a released projection is told so.
+    // The release of a projection that was not made must not hang.
     bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
     bench.performer.closed().await
 }
