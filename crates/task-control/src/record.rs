@@ -244,7 +244,7 @@ impl Recorder {
                     let operating = self.operate(instance, number, operations, &order);
                     let operated = trace::within(self.of(instance), operating).await;
                     behind = Some(order);
-                    // Whoever resumes the run does not do it again.
+                    // The event is logged, so that a resumption does not repeat the operation.
                     Some(operated.unwrap_or_else(|failed| failed))
                 }
                 Record::Failed(reason) => {
@@ -396,7 +396,7 @@ impl MakingProjection {
         let made = self.ask().await;
         match (made, self.named.take()) {
             (Ok(_), Some(named)) => {
-                // If the goal has the projection's id, it is under way and no event is needed.
+                // Nobody receives this message if the goal is under way already.
                 let _ = named.made.send(Made);
                 None
             }
