@@ -39,6 +39,9 @@ struct Within {
 /// What stands around, and where the hand is to be at the start and the goal, if that matters.
 type Scene = (Vec<Thing>, Option<[Within; 2]>);
 
+/// Draws a scene.
+type Make = fn(&Robot, &mut ChaCha8Rng) -> Scene;
+
 /// The robot and how far it reaches.
 struct Robot {
     mechanism: Mechanism,
@@ -53,7 +56,7 @@ fn main() {
     let joints: Vec<String> = arguments[2].split(',').map(str::to_owned).collect();
     let (seed, count): (u64, usize) = (arguments[3].parse().unwrap(), arguments[4].parse().unwrap());
     let robot = Robot::new(Mechanism::read(&read(0), Some(&read(1)), &joints).unwrap());
-    let classes: [(&str, fn(&Robot, &mut ChaCha8Rng) -> Scene); 6] = [
+    let classes: [(&str, Make); 6] = [
         ("balls", |robot, random| scattered(robot, random, 24, ball)),
         ("bars", |robot, random| scattered(robot, random, 16, bar)),
         ("boxes", |robot, random| scattered(robot, random, 12, cuboid)),

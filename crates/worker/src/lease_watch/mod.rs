@@ -388,7 +388,7 @@ impl LeaseWatch {
             Source::Session { client, state, id, .. } => {
                 // A closed session reports nothing more, and this watch ends with it.
                 let mut state = state.clone();
-                let Ok(now) = state.wait_for(|s| s.alive).await.map(|s| s.clone()) else { pending().await };
+                let Ok(now) = state.wait_for(|s| s.alive).await.map(|s| *s) else { pending().await };
                 // A session that was opened again has no leases from before.
                 (ResourceClient::clone(client), id.as_str(), now.generation, now.found && now.generation == 1)
             }
