@@ -131,15 +131,15 @@ pub enum Event {
         operation: u64,
         /// Number of the session with these records; it is the run's session from now on.
         session: u64,
-        /// What that operation has created, deleted and used up, by its requirements. Nothing where the resource manager does not say all of it, or
-        /// where only more than one operation is told of.
+        /// The units that this operation has created, deleted and used up, for each of its requirements. Empty if the resource manager does not
+        /// report all of them, or if more than one operation is reported at once.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         units: Vec<Vec<OperatedUnits>>,
-        /// What the run had created before is made anew in that session: the new ids by those of before.
+        /// If the run's resources were created again in that session: the new ids by the old ones.
         #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
         renamed: BTreeMap<String, String>,
     },
-    /// When task control came back, the session under which the run held its resources was gone. Logged; changes nothing.
+    /// When task control resumed the run, the session under which the run held its resources was gone. Logged; changes nothing.
     SessionLost {
         /// The world pool's revision of the run's last commit, or of its start. Up to this revision the run held its resources; later changes may have
         /// been made by others with the same resources.

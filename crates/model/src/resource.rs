@@ -146,12 +146,12 @@ pub struct Lease {
 pub struct OperatedUnits {
     /// The resource's id.
     pub resource: String,
-    /// Its kind, which may be below the one that was asked for.
+    /// Its kind, which may be a subclass of the requested one.
     pub kind: String,
     /// How much of it.
     pub units: Quantity,
-    /// Whether that is over with the session that it was done for: what was created vanishes, what was used up returns or vanishes, and what was
-    /// deleted would have vanished. Otherwise it stays so.
+    /// Whether the effect ends with the session for which it was made: created units vanish, used-up units return or vanish, and deleted units would
+    /// have vanished. Otherwise the effect stays.
     pub ends_with_session: bool,
 }
 

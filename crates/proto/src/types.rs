@@ -1,5 +1,5 @@
-//! What the services speak of and no core owns: resources as the resource manager lists them, facts with their revision,
-//! worker processes, goals and their results. Plain data.
+//! Data that the services exchange and that no core owns: resources as the resource manager lists them, facts with their revision, worker processes,
+//! goals and their results. Plain data.
 
 use ratn_model::condition::Condition;
 use ratn_model::fact::FactKey;
@@ -11,21 +11,21 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The attribute of a resource that says where its action service is.
+/// The attribute of a resource with the address of its action service.
 pub const ENDPOINT_ATTRIBUTE: &str = "endpoint";
-/// The kind of the resource that a host is: by its endpoint the host's process manager is found.
+/// The kind of the resource that represents a host: its endpoint is that of the host's process manager.
 pub const HOST_KIND: &str = "Host";
 
-/// The attribute by which a provider asks for time to stop what moves when a lease of its resource has ended, in milliseconds.
+/// The attribute by which a provider asks for time, in milliseconds, to stop motions when a lease of its resource has ended.
 pub const STANDSTILL_ATTRIBUTE: &str = "standstill_ms";
 
-/// What a resource is doing.
+/// The availability of a resource.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum ResourceState {
-    /// At least one unit can be had.
+    /// At least one unit is available.
     #[default]
     Free,
-    /// No unit can be had now; some come back when a lease ends.
+    /// No unit is available now; some return when a lease ends.
     Leased,
     /// Every unit has been consumed.
     Exhausted,
@@ -42,9 +42,9 @@ pub struct Holding {
     pub units: Quantity,
     /// The session of the lease.
     pub session: String,
-    /// What the holder said it is, for people.
+    /// Description of the holder, for people.
     pub holder: String,
-    /// Who opened that session, as the connection proved it; empty where nobody knows.
+    /// The caller who opened that session, as the connection proved; empty if unknown.
     pub opened_by: String,
 }
 
@@ -57,7 +57,7 @@ pub struct EndingUnits {
     pub token: FencingToken,
     /// How much.
     pub units: Quantity,
-    /// The session that the lease was of.
+    /// The session that had the lease.
     pub session: String,
     /// They are free after this many milliseconds at the latest.
     pub within_ms: u64,
@@ -72,27 +72,27 @@ pub struct Resource {
     pub class: ResourceClass,
     /// Its kind, `PathPlanner`.
     pub kind: String,
-    /// What selectors compare with.
+    /// The attributes that selectors compare.
     pub attributes: BTreeMap<String, Value>,
-    /// How much of it there is in all, more than nothing; whole units unless it is divisible.
+    /// The total amount, greater than zero; whole units unless the resource is divisible.
     pub capacity: Quantity,
-    /// Parts of a unit can be had.
+    /// Whether parts of a unit can be acquired.
     pub divisible: bool,
-    /// What a task consumed returns when the task ends.
+    /// Whether consumed units return when the task ends.
     pub renewable: bool,
-    /// The host that it is on; may be empty.
+    /// The host on which it is; may be empty.
     pub host: String,
     /// The session that owns it.
     pub session: String,
-    /// The revision of the pool that changed it last.
+    /// The pool's revision of its last change.
     pub revision: Revision,
-    /// What it is doing.
+    /// Its availability.
     pub state: ResourceState,
-    /// How much can be had now.
+    /// The available amount.
     pub free: Quantity,
-    /// Who has some of it.
+    /// Who holds units of it.
     pub holdings: Vec<Holding>,
-    /// What leases that have ended have left, until its provider has confirmed standstill.
+    /// Units that ended leases have left, until the provider has confirmed standstill.
     pub ending: Vec<EndingUnits>,
 }
 
@@ -124,14 +124,14 @@ impl Resource {
         self
     }
 
-    /// With a provider that confirms within `bound` that nothing moves any more for a lease that has ended.
+    /// With a provider that confirms standstill within `bound` after a lease has ended.
     #[must_use]
     pub fn with_standstill(self, bound: Duration) -> Resource {
         let bound = i64::try_from(bound.as_millis()).unwrap_or(i64::MAX);
         self.with_attribute(STANDSTILL_ATTRIBUTE, Value::Int(bound))
     }
 
-    /// Within which its provider confirms that nothing moves any more for a lease that has ended; nothing where nothing moves.
+    /// The bound within which its provider confirms standstill after a lease has ended; `None` if nothing moves.
     pub fn standstill(&self) -> Option<Duration> {
         match self.attributes.get(STANDSTILL_ATTRIBUTE) {
             Some(Value::Int(ms)) => u64::try_from(*ms).ok().filter(|ms| *ms > 0).map(Duration::from_millis),
@@ -139,13 +139,13 @@ impl Resource {
         }
     }
 
-    /// With its action service at `endpoint`.
+    /// With its action service at this address.
     #[must_use]
     pub fn with_endpoint(self, endpoint: impl ToString) -> Resource {
         self.with_attribute(ENDPOINT_ATTRIBUTE, Value::String(endpoint.to_string()))
     }
 
-    /// With so much of it.
+    /// With this total amount.
     #[must_use]
     pub fn with_capacity(mut self, capacity: impl Into<Quantity>) -> Resource {
         self.capacity = capacity.into();
@@ -153,14 +153,14 @@ impl Resource {
         self
     }
 
-    /// Of which parts of a unit can be had.
+    /// With units that can be acquired in parts.
     #[must_use]
     pub fn divisible(mut self) -> Resource {
         self.divisible = true;
         self
     }
 
-    /// Of which what is consumed is gone for good.
+    /// With units that do not return once they are consumed.
     #[must_use]
     pub fn non_renewable(mut self) -> Resource {
         self.renewable = false;
@@ -174,7 +174,7 @@ impl Resource {
         self
     }
 
-    /// Where its action service is; empty where it performs nothing.
+    /// The address of its action service; empty if it performs no actions.
     pub fn endpoint(&self) -> &str {
         match self.attributes.get(ENDPOINT_ATTRIBUTE) {
             Some(Value::String(endpoint)) => endpoint,
@@ -188,25 +188,25 @@ impl Resource {
 pub struct WaitingAcquire {
     /// Its request id; may be empty.
     pub request: String,
-    /// Who asks.
+    /// The session that asks.
     pub session: String,
-    /// What the holder is to be, for people.
+    /// Description of the future holder, for people.
     pub holder: String,
     /// Larger first.
     pub priority: i64,
-    /// How many are served before it.
+    /// Number of requests that are served before it.
     pub ahead: u32,
     /// What is in the way, for people.
     pub obstacles: Vec<String>,
-    /// The leases that hold what it lacks.
+    /// The leases that hold the units that it lacks.
     pub held_by: Vec<LeaseId>,
     /// The share of its session.
     pub share: f64,
-    /// In how many milliseconds the task of its session is due, if it is.
+    /// In how many milliseconds its session's task is due; `None` if it is never due.
     pub due_in_ms: Option<i64>,
-    /// It may turn out not to be needed.
+    /// Whether the resources may turn out not to be needed.
     pub speculative: bool,
-    /// For how long it has waited, with what it took the place of.
+    /// How long it has waited, including the wait of the request whose place it took.
     pub waiting_ms: u64,
 }
 
@@ -215,27 +215,27 @@ pub struct WaitingAcquire {
 pub struct SessionStatus {
     /// Its id.
     pub id: String,
-    /// Who that is, for people.
+    /// The client's name, for people.
     pub client: String,
     /// How long it lives without a ping, in milliseconds.
     pub ttl_ms: u64,
-    /// In how many milliseconds it ends unless pinged.
+    /// In how many milliseconds it ends without another ping.
     pub expires_in_ms: u64,
     /// Its leases.
     pub leases: Vec<LeaseId>,
-    /// How many of its acquires wait.
+    /// Number of its queued acquires.
     pub waiting: u32,
     /// The resources that it provides.
     pub resources: Vec<String>,
-    /// Who opened it, as the connection proved it: nobody else speaks for it, except an operator. Empty where nobody knows.
+    /// The caller who opened it, as the connection proved: nobody but an operator may also use it. Empty if unknown.
     pub opened_by: String,
-    /// Its share of what several want.
+    /// Its share of contested resources.
     pub share: f64,
-    /// In how many milliseconds its task is due, if it is.
+    /// In how many milliseconds its task is due; `None` if it is never due.
     pub due_in_ms: Option<i64>,
 }
 
-/// Which resources a list is of; the default is all of them.
+/// The resources to list; the default is all of them.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ResourceFilter {
     /// Only of these kinds; empty for every kind.
@@ -244,11 +244,11 @@ pub struct ResourceFilter {
     pub class: Option<ResourceClass>,
     /// Only on this host; empty for every host.
     pub host: String,
-    /// Only those that have these attributes.
+    /// Only those with these attributes.
     pub attributes: BTreeMap<String, Value>,
-    /// Only those that this session provides; empty for everybody's.
+    /// Only those that this session provides; empty for all sessions.
     pub session: String,
-    /// Only those whose attributes are like this; all of them.
+    /// Only those whose attributes satisfy all of these conditions.
     pub conditions: Vec<Condition>,
 }
 
@@ -261,7 +261,7 @@ pub enum ResourceEventKind {
     Updated,
     /// It is gone; a lease of it has ended.
     Deleted,
-    /// Units of it went to a lease.
+    /// Units of it were granted to a lease.
     Leased,
     /// A lease of it ended: released, expired, or lost.
     Released,
@@ -270,7 +270,7 @@ pub enum ResourceEventKind {
 /// One change of one resource.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ResourceEvent {
-    /// The pool's revision with it.
+    /// The pool's revision after it.
     pub revision: Revision,
     /// What happened.
     pub kind: ResourceEventKind,
@@ -278,22 +278,22 @@ pub struct ResourceEvent {
     pub resource: Resource,
     /// The lease, when leased or released.
     pub lease: Option<(LeaseId, FencingToken)>,
-    /// Why, where there is something to say.
+    /// The reason, if there is one.
     pub reason: String,
-    /// Which of the events of its revision it is, from 0.
+    /// Its number among the events of its revision, from 0.
     pub part: u32,
 }
 
 /// How a provider provides a kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Provision {
-    /// At most so many of it.
+    /// Maximum amount of it.
     pub most: u32,
-    /// It starts more of it as well for requests that wait for what exists and is held.
+    /// Whether the provider also starts more of it for requests that wait for existing units held by others.
     pub grows: bool,
 }
 
-/// What a request of before came to. Of one that an earlier version of the resource manager performed nothing is known but that.
+/// The result of an earlier request. If an earlier version of the resource manager performed it, only that it was performed is known.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Recalled {
     /// The id of what it created.
@@ -302,30 +302,30 @@ pub struct Recalled {
     pub operated: Vec<OperatedUnits>,
 }
 
-/// What waits for more than exists, or has waited for long for what is held.
+/// Resources that are missing, or held by others while requests have waited for long.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Demand {
-    /// What is selected; its count is how much is to come beside those that the provider's session provides.
+    /// The selector; its count is the amount needed in addition to what the provider's session provides.
     pub requirement: Requirement,
-    /// The kinds that would do: its kind, and those below it.
+    /// The kinds that satisfy it: its kind, and the subclasses.
     pub kinds: Vec<String>,
-    /// How much of it the provider's session provides already.
+    /// The amount that the provider's session already provides.
     pub provided: Quantity,
-    /// How much of the count is for requests that wait for what exists and is held.
+    /// The part of the count for requests that wait for existing units held by others.
     pub queued: Quantity,
 }
 
-/// From where a watch goes on.
+/// The position from which a watch continues.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WatchPosition {
     /// After this revision.
     pub revision: Revision,
-    /// And of the events of that revision after this one; `None` after all of them.
+    /// And after this event of that revision; `None`: after all its events.
     pub part: Option<u32>,
 }
 
 impl ResourceEvent {
-    /// Where a watch goes on that has seen this event last.
+    /// The position of a watch that has seen this event last.
     pub fn position(&self) -> WatchPosition {
         WatchPosition { revision: self.revision, part: Some(self.part) }
     }
@@ -337,46 +337,46 @@ impl From<Revision> for WatchPosition {
     }
 }
 
-/// What a watch of resources tells: the snapshot first, once.
+/// A message of a watch of resources: first one snapshot, then events.
 #[expect(clippy::large_enum_variant, reason = "most are events, and each is handled where it arrives")]
 #[derive(Debug, Clone, PartialEq)]
 pub enum ResourceUpdate {
-    /// What is there; events follow from the next revision on.
+    /// The present resources; events follow from the next revision on.
     Snapshot {
         /// The pool's revision.
         revision: Revision,
-        /// In the order of ids.
+        /// Sorted by id.
         resources: Vec<Resource>,
-        /// The lease that was granted last, living or not.
+        /// The lease that was granted last, live or ended.
         youngest: LeaseId,
     },
-    /// What happened since.
+    /// A change since then.
     Event(ResourceEvent),
 }
 
-/// A fact with the revision of the world that wrote it (0 for a measured one), who wrote it and what measured it.
+/// A fact with the revision of the world that wrote it (0 for a measured fact), its writer and its measurement.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FactRecord {
     /// Which fact.
     pub key: FactKey,
-    /// What it says.
+    /// Its value.
     pub value: Value,
-    /// When it was written.
+    /// The revision that wrote it.
     pub revision: Revision,
     /// The node that wrote it, by the path of its instance.
     pub writer: Option<Arc<str>>,
-    /// What measured it.
+    /// Its measurement, if it was measured.
     pub measured: Option<Arc<Measurement>>,
 }
 
-/// What watchers of the root world are told.
+/// A message to watchers of the root world.
 #[derive(Debug, Clone, PartialEq)]
 pub enum WorldUpdate {
-    /// What holds; changes follow from the next revision on.
+    /// The present facts; changes follow from the next revision on.
     Snapshot {
         /// The root's revision.
         revision: Revision,
-        /// In the order of keys.
+        /// Sorted by key.
         facts: Vec<FactRecord>,
     },
     /// What a revision changed.
@@ -388,63 +388,63 @@ pub enum WorldUpdate {
 pub struct WorldChange {
     /// The revision.
     pub revision: Revision,
-    /// The commit's id; empty where facts were too old.
+    /// The commit's id; empty if facts have expired.
     pub commit: String,
-    /// In the order of keys.
+    /// Written facts, sorted by key.
     pub written: Vec<FactRecord>,
-    /// What is gone, in the order of keys.
+    /// Deleted facts, sorted by key.
     pub gone: Vec<FactKey>,
     /// The node that committed it, by the path of its instance.
     pub writer: Option<Arc<str>>,
 }
 
-/// A fact in two revisions; `None` where it does not hold.
+/// A fact in two revisions; `None` if it does not exist there.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FactDifference {
     /// Which fact.
     pub key: FactKey,
-    /// In the one.
+    /// In the first revision.
     pub before: Option<FactRecord>,
-    /// In the other.
+    /// In the second revision.
     pub after: Option<FactRecord>,
 }
 
 /// A projection that a revision of the root world contradicts.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Contradiction {
-    /// Which.
+    /// The projection.
     pub projection: ProjectionId,
-    /// The first fact, in the order of keys, that it showed and that is otherwise.
+    /// The first fact, sorted by key, whose shown value is wrong.
     pub fact: FactKey,
-    /// What it showed; `None`: that there is no such fact.
+    /// The value that it showed; `None`: no such fact.
     pub was: Option<Value>,
-    /// What it would show now.
+    /// The value that it would show now.
     pub is: Option<Value>,
-    /// The revision that made it so.
+    /// The revision that contradicts it.
     pub revision: Revision,
 }
 
-/// What a fact was from one revision on.
+/// The value of a fact from one revision on.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FactVersion {
     /// The revision that wrote or deleted it.
     pub revision: Revision,
-    /// The commit's id; empty where it was too old, or is not kept any more.
+    /// The commit's id; empty if the fact expired, or if the id is not kept any more.
     pub commit: String,
-    /// `None` where it does not hold.
+    /// `None` if the fact does not exist from then on.
     pub fact: Option<FactRecord>,
     /// The node that wrote or deleted it, by the path of its instance.
     pub writer: Option<Arc<str>>,
 }
 
-/// What a worker process is doing.
+/// The state of a worker process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WorkerState {
     /// It was spawned and is not serving yet.
     Starting,
     /// Its health is SERVING and its resource exists.
     Ready,
-    /// It is to end: once nobody holds it, or right now.
+    /// It is to end: when nobody holds it any more, or at once.
     Stopping,
     /// The process is gone.
     Exited,
@@ -453,25 +453,25 @@ pub enum WorkerState {
 /// A worker process.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct WorkerStatus {
-    /// Its id, also that of its resource.
+    /// Its id, which is also the id of its resource.
     pub id: String,
     /// The template that it was started from.
     pub template: String,
-    /// What it is doing.
+    /// Its state.
     pub state: WorkerState,
     /// The process id.
     pub pid: u32,
-    /// Where its action service is; empty before it is ready.
+    /// The address of its action service; empty before it is ready.
     pub endpoint: String,
-    /// Why it exited, else empty.
+    /// The reason of its exit; else empty.
     pub reason: String,
     /// Resident memory, in bytes; only where pools are listed.
     pub resident_bytes: u64,
     /// Processor use since the last listing, in thousandths of a core; only where pools are listed.
     pub cpu_millicores: u32,
-    /// What it may use of the machine, and what keeps it to that; empty without limits.
+    /// Its limits on the machine, and how they are enforced; empty without limits.
     pub limits: String,
-    /// How long its process has been there, in seconds; only where pools are listed.
+    /// The age of its process in seconds; only where pools are listed.
     pub age_s: u64,
     /// Whether somebody holds its resource.
     pub held: bool,
@@ -482,21 +482,21 @@ pub struct WorkerStatus {
 pub struct PoolStatus {
     /// The template's name.
     pub template: String,
-    /// The kind of resource that its workers are.
+    /// The kind of resource of its workers.
     pub kind: String,
-    /// At least so many workers are kept.
+    /// Minimum number of workers.
     pub min: u32,
-    /// At most so many are started.
+    /// Maximum number of workers.
     pub max: u32,
-    /// The oldest first.
+    /// Oldest first.
     pub workers: Vec<WorkerStatus>,
-    /// Why no more workers are started; empty while all is well.
+    /// Why no more workers are started; empty if nothing is wrong.
     pub failure: String,
-    /// So many more than are held are kept ready.
+    /// Number of workers that are kept ready beyond those that are held.
     pub spares: u32,
-    /// Workers that ended without being asked to, since the process manager began.
+    /// Number of workers that ended unasked since the process manager began.
     pub crashes: u64,
-    /// How the last worker ended that did; empty while none has.
+    /// How the last of these workers ended; empty if there was none.
     pub last_exit: String,
 }
 
@@ -505,13 +505,13 @@ pub struct PoolStatus {
 pub struct HostPools {
     /// The host's name.
     pub host: String,
-    /// It takes no new work.
+    /// Whether it takes no new work.
     pub draining: bool,
-    /// What the clock of the host's wall showed when it answered, in microseconds since 1970.
+    /// The wall clock of the host when it answered, in microseconds since 1970.
     pub clock_us: u64,
-    /// How the processes of workers are tracked; `None` where the process manager does not tell.
+    /// How the processes of workers are tracked; `None` if the process manager does not report it.
     pub tracking: Option<TrackingMode>,
-    /// In the order of templates.
+    /// Sorted by template.
     pub pools: Vec<PoolStatus>,
 }
 
@@ -527,14 +527,14 @@ pub enum TrackingMode {
     Marker,
 }
 
-/// How many workers a template is to have; what is `None` stays as it is.
+/// The desired number of workers of a template; `None` leaves a value unchanged.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Scale {
-    /// At least so many are kept.
+    /// Minimum number of workers.
     pub min: Option<u32>,
-    /// At most so many are started.
+    /// Maximum number of workers.
     pub max: Option<u32>,
-    /// So many more than are held are kept ready.
+    /// Number of workers to keep ready beyond those that are held.
     pub spares: Option<u32>,
 }
 
@@ -547,50 +547,50 @@ pub struct Goal {
     pub action: String,
     /// The input ports.
     pub inputs: BTreeMap<String, Value>,
-    /// What the action's random choices are derived from.
+    /// Seed of the action's random choices.
     pub seed: u64,
-    /// What the action may use; the provider is in it.
+    /// The lease of the resources that the action may use; it contains the provider.
     pub lease: Option<Lease>,
-    /// The session that holds the lease; empty where that is not said.
+    /// The session that holds the lease; empty if not named.
     pub session: String,
-    /// The world that it works on.
+    /// The projection that it works on.
     pub projection: Option<ProjectionId>,
-    /// Where the world pool is; empty where the action needs none.
+    /// The address of the world pool; empty if the action needs none.
     pub world_pool: String,
     /// Cancelled this long after its arrival, in milliseconds of wall time; 0 never.
     pub deadline_ms: u64,
-    /// How long it may go on when nobody listens to it, in milliseconds of wall time; 0 not at all.
+    /// How long it goes on when nobody listens to it, in milliseconds of wall time; 0: not at all.
     pub grace_ms: u64,
-    /// Where it may give a result, go on and give better ones: the outputs that stay as they were in the first.
+    /// If the goal may give a result and then better ones: the outputs that stay as in the first result.
     pub improves: Option<Vec<String>>,
 }
 
-/// A result that can be used, of a goal that goes on for a better one.
+/// A usable result of a goal that goes on for a better one.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct GoalImproved {
-    /// The output ports, as of a goal that ends with success.
+    /// The output ports, as for a goal that ends with success.
     pub outputs: BTreeMap<String, Value>,
-    /// What it costs whoever uses it, in seconds of the robot's time.
+    /// The cost of the result for its user, in seconds of the robot's time.
     pub cost_s: f64,
 }
 
-/// How a goal has ended.
+/// The end of a goal.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct GoalOutcome {
     /// `success`, `aborted`, `preempted`, or one of the action's own.
     pub outcome: String,
     /// The output ports.
     pub outputs: BTreeMap<String, Value>,
-    /// Facts as measured.
+    /// Measured facts.
     pub measured: Vec<(FactKey, Value)>,
-    /// What measured them and how sure that is, of those of which it is said.
+    /// What measured them, and with which certainty, as far as this is reported.
     pub evidence: Evidence,
-    /// Why, when the outcome is not success; else empty.
+    /// The reason, if the outcome is not success; else empty.
     pub reason: String,
 }
 
 impl GoalOutcome {
-    /// It did what it should.
+    /// The goal was achieved.
     pub fn success() -> GoalOutcome {
         GoalOutcome::named(ratn_model::program::SUCCESS)
     }
@@ -600,7 +600,7 @@ impl GoalOutcome {
         GoalOutcome { reason: reason.into(), ..GoalOutcome::named(ratn_model::program::ABORTED) }
     }
 
-    /// It was told to stop.
+    /// The goal was cancelled.
     pub fn preempted(reason: impl Into<String>) -> GoalOutcome {
         GoalOutcome { reason: reason.into(), ..GoalOutcome::named(ratn_model::program::PREEMPTED) }
     }
@@ -622,21 +622,21 @@ impl GoalOutcome {
         self
     }
 
-    /// With a fact as measured.
+    /// With a measured fact.
     #[must_use]
     pub fn with_measured(mut self, fact: FactKey, value: Value) -> GoalOutcome {
         self.measured.push((fact, value));
         self
     }
 
-    /// With a fact as measured, and how sure that is. What measured it is whoever says so.
+    /// With a measured fact and its certainty. The source of the measurement is the provider that reports it.
     #[must_use]
     pub fn with_certain(mut self, fact: FactKey, value: Value, certainty: Certainty) -> GoalOutcome {
         self.evidence.push((fact.clone(), Measurement { source: String::new(), certainty: Some(certainty) }));
         self.with_measured(fact, value)
     }
 
-    /// Whether it did what it should.
+    /// Whether the goal was achieved.
     pub fn is_success(&self) -> bool {
         self.outcome == ratn_model::program::SUCCESS
     }

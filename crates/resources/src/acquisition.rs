@@ -1,4 +1,4 @@
-//! Acquire, and how one ends: granted, refused, withdrawn, released.
+//! Acquires, and how each ends: granted, refused, withdrawn or released.
 
 use crate::caller::{Share, for_all};
 use crate::error::{ALL, ALL_BUT_OPERATORS, PoolError, check_owner, malformed};
@@ -21,10 +21,10 @@ use ratn_model::resource::{Lease, ResourceOperation};
 use ratn_model::time::Timestamp;
 
 impl Pool {
-    /// Asks for several resources, all or nothing. How it ends comes as a [`Notice`], at once where it can be granted.
+    /// Asks for several resources, all or nothing. The result comes as a [`Notice`], at once if the request can be granted now.
     ///
     /// # Errors
-    /// An unknown session, no requirement, other operations than block, consume and exists, a passed deadline, a full queue.
+    /// An unknown session, no requirement, operations other than block, consume and exists, a passed deadline, or a full queue.
     pub fn acquire(&mut self, now: Timestamp, request: AcquireRequest) -> Result<WaiterId, PoolError> {
         self.begin(now);
         self.enqueue(request, RequestId::default(), Fingerprint::UNKNOWN)
@@ -42,9 +42,9 @@ impl Pool {
         Ok(())
     }
 
-    /// Undoes an acquire by its request id: takes it out of the queue, or ends the lease that it was granted. The same request id once
-    /// more acquires anew. False when there is nothing to undo: an acquire of an id that nobody has asked with may be on its way, and is
-    /// refused when it arrives ([`PoolError::Withdrawn`]), for as long as answers are remembered.
+    /// Undoes an acquire by its request id: takes it out of the queue, or ends the lease that it was granted. The same request id may acquire anew
+    /// after that. False if there is nothing to undo: if nobody has asked with this id, its acquire may be on its way, and is refused when it arrives
+    /// ([`PoolError::Withdrawn`]), for as long as answers are remembered.
     ///
     /// # Errors
     /// An acquire of another session.
@@ -59,7 +59,7 @@ impl Pool {
         Ok(undone)
     }
 
-    /// As [`Pool::withdraw`]; an acquire that was not heard of yet is none of it.
+    /// As [`Pool::withdraw`], but does not refuse an acquire that arrives later.
     ///
     /// # Errors
     /// As there.
@@ -84,8 +84,8 @@ impl Pool {
         Ok(true)
     }
 
-    /// Ends a lease: its holder gives it back, and says by that that nothing is to move for it any more. `None` as session may
-    /// release anything, which revokes it.
+    /// Ends a lease: its holder gives it back, and thereby says that nothing moves for it any more. With `None` as session, any lease may be
+    /// released, which revokes it.
     ///
     /// # Errors
     /// An unknown or ended lease, or one of another session.
@@ -115,9 +115,9 @@ impl Pool {
         self.confirm_standstill_as(now, &Speaker::trusted(), session, lease, resource)
     }
 
-    /// The provider of a resource says that nothing moves any more for a lease that has ended: what that had left of the resource is
-    /// free. False when it had left nothing, or lives. Of what no session provides, the lease's own session says so; it may have ended
-    /// and been opened anew, but by nobody else than its opener of then. `None` as session may say it of anything.
+    /// The provider of a resource confirms standstill: nothing moves any more for a lease that has ended, so the units that this lease had left are
+    /// free. False if it had left none, or is alive. For a resource that no session provides, the session of the lease confirms; that session may
+    /// have ended and been opened again, but only by the same caller. `None` as session may confirm for anything.
     ///
     /// # Errors
     /// An unknown resource, or one that another session provides; a lease of a session that another opened.
@@ -148,8 +148,7 @@ impl Pool {
         Ok(true)
     }
 
-    /// Takes back a grant that nobody heard of, and what was consumed with it. Its request may be asked again with its id, and
-    /// waits again.
+    /// Takes back a grant that nobody heard of, and what was consumed with it. Its request may be repeated under its id, and waits again.
     ///
     /// # Errors
     /// An unknown or ended lease.
@@ -187,13 +186,13 @@ impl Pool {
         let kept = replaced.as_ref().and_then(|(_, of)| of.kept_by(self.now, request.speculative, &groups));
         let queued = self.enqueue_keeping(request, request_id, fingerprint, groups, kept);
         if let (Err(_), Some((id, earlier))) = (&queued, replaced) {
-            // Who is refused may come back for what it had waited.
+            // A refused request may come again and keep the time that it had waited.
             self.left.leaves(self.now, id, earlier);
         }
         queued
     }
 
-    /// The same of a request that is in order, with what it keeps of the one that it replaces.
+    /// Queues a request that was checked, with what it keeps of the request that it replaces.
     fn enqueue_keeping(
         &mut self,
         request: AcquireRequest,
@@ -215,7 +214,7 @@ impl Pool {
             self.schedule();
             return Ok(id);
         }
-        // A more urgent one may be served with what a waiter has reserved; of any other one it is known that it has to wait.
+        // A more urgent request may be served with what a waiter has reserved; any other one certainly has to wait.
         if let Some(full) = full.as_ref().filter(|_| !self.is_before_others(place, &request.requirements)) {
             return Err(full.clone());
         }
@@ -261,7 +260,7 @@ impl Pool {
         }
     }
 
-    /// Whether the caller of a session may have one more lease.
+    /// Checks that the caller of a session may have one more lease.
     fn check_leases(&self, session: &Session) -> Result<(), PoolError> {
         let (caller, limit) = (&session.opened_by, self.limits.leases_per_caller);
         if session.is_operators() || self.callers.leases(caller) + self.callers.waiters(caller) < limit {
@@ -270,7 +269,7 @@ impl Pool {
         Err(PoolError::Quota { what: "leases", whose: caller.clone(), quota: "leases_per_caller", limit })
     }
 
-    /// Whether somebody may wait for these.
+    /// Checks that somebody may wait for these selectors.
     fn check_selectors(&self, session: &Session, groups: &[Key]) -> Result<(), PoolError> {
         let share = Share {
             what: "different selectors waited for",
@@ -291,7 +290,7 @@ impl Pool {
         Err(PoolError::Quota { what, whose: caller.clone(), quota: "selectors_per_caller", limit })
     }
 
-    /// Why one more of a session could not wait, if it could not.
+    /// Why one more acquire of a session could not wait; `None` if it could.
     fn no_room(&self, session: &SessionId) -> Result<Option<PoolError>, PoolError> {
         let (known, limits) = (self.session(session)?, &self.limits);
         let (of_session, caller) = (known.waiters.len(), &known.opened_by);
@@ -312,7 +311,7 @@ impl Pool {
         })
     }
 
-    /// Gives a waiter what was found for it.
+    /// Grants a waiter the units that were found for it.
     pub(crate) fn grant(&mut self, id: WaiterId, taken: Vec<Units>) {
         let Some((waiter, fingerprint)) = self.leave(id, true) else { return };
         self.give(waiter.place(id), waiter.request, waiter.request_id, fingerprint, taken);
@@ -387,7 +386,7 @@ impl Pool {
         Some(Lease { id, token: record.token, resources, consumed: consumed.collect() })
     }
 
-    /// Takes a waiter from everywhere; with the fingerprint of its request.
+    /// Removes a waiter from the queue and its indices; returns it with the fingerprint of its request.
     fn leave(&mut self, id: WaiterId, granted: bool) -> Option<(Waiter, Fingerprint)> {
         let competed = self.queue.get(id)?.hopeful;
         let waiter = self.part(id, granted)?;

@@ -1,12 +1,12 @@
-//! Assigns resources to requirements: a maximum assignment, so that every request that can be served is.
+//! Assigns resources to requirements: a maximum assignment, so that every request that can be served is served.
 //!
-//! Requirements take greedily, each from the resources that it fits, in the order in which those are given away. Where that falls
-//! short and several requirements fit the same resources (`PathPlanner` beside `PathPlanner{host: a}`), amounts are moved by a
-//! maximum flow (`flow.rs`). Its nodes are not resources but signatures: all resources that the same requirements fit are one node,
-//! with how much there is of them. What was moved is placed on the resources of those nodes anew.
+//! Requirements take greedily, in order, from the resources that fit. If some of them lack something and several requirements fit the same resources
+//! (`PathPlanner` beside `PathPlanner{host: a}`), amounts are moved by a maximum flow (`flow.rs`). The nodes of the flow are not resources but
+//! signatures: all resources that the same requirements fit are one node, with their total amount. Moved amounts are placed again on the resources of
+//! those nodes.
 //!
-//! A requirement of whole units takes whole units of each resource; only of divisible ones it may be less. The work grows with the
-//! number of resources that the requirements select, times the number of requirements.
+//! A requirement of whole units takes whole units of each resource; only a divisible resource can be taken in parts. The work grows with the number
+//! of resources that the requirements select, times the number of requirements.
 
 mod flow;
 
@@ -22,20 +22,20 @@ use std::iter::Peekable;
 /// How far the requirements of one request can be served.
 #[derive(Debug)]
 pub(crate) struct Assignment {
-    /// Per requirement, what it gets (nothing for `exists`).
+    /// For each requirement, the units that it gets (none for `exists`).
     pub(crate) taken: Vec<Units>,
-    /// Per requirement, what is missing.
+    /// For each requirement, the missing amount.
     pub(crate) missing: Vec<Quantity>,
-    /// How many resources were looked at for it, those that do not fit included.
+    /// Number of resources examined for it, including those that do not fit.
     pub(crate) looked_at: usize,
 }
 
 /// What counts as available.
 #[derive(Clone, Copy)]
 pub(crate) enum Available<'a> {
-    /// What is free without what is reserved.
+    /// The free units without the reserved ones.
     Free(&'a Units),
-    /// As [`Available::Free`], for a waiter that has some of the reserved itself.
+    /// As [`Available::Free`], for a waiter that has reserved some of the units itself.
     FreeTo(&'a Units, &'a [Units]),
     /// Everything that exists and is not consumed, whoever holds it.
     Existing,
@@ -51,7 +51,7 @@ impl Assignment {
         Assignment::among(resources, available, requirements, None)
     }
 
-    /// The same for one requirement, of one resource alone.
+    /// The same for one requirement and one resource.
     pub(crate) fn of_one(
         resources: &Resources,
         available: Available<'_>,
@@ -90,7 +90,7 @@ impl Assignment {
     }
 }
 
-/// Requirements that select the same in the same grain: for them every resource is alike.
+/// Requirements with the same selector and the same grain: for them all resources are alike.
 struct Class<'a> {
     selector: &'a Requirement,
     grain: Quantity,
@@ -101,7 +101,7 @@ struct Class<'a> {
 struct Search<'a> {
     resources: &'a Resources,
     available: Available<'a>,
-    /// Nothing but this resource.
+    /// Only this resource, if set.
     alone: Option<Slot>,
     classes: Vec<Class<'a>>,
     taken: Vec<Units>,
@@ -112,11 +112,11 @@ struct Search<'a> {
 type Candidates<'a> = Box<dyn Iterator<Item = (Slot, &'a Resource)> + 'a>;
 
 impl<'a> Search<'a> {
-    /// Each requirement takes what is there, in order.
+    /// Each requirement takes what is available, in order.
     fn greedy(&mut self, requirements: &[&Requirement]) {
         let class_of = |index: usize| self.classes.iter().position(|class| class.members.contains(&index));
         let classes: Vec<Option<usize>> = (0..requirements.len()).map(class_of).collect();
-        // What one requirement has emptied or cannot use is not looked at again by the next of its class.
+        // A resource that one requirement has emptied or cannot use is not examined again for the next one of its class.
         let candidates = self.classes.iter().map(|class| self.candidates(class).peekable());
         let mut candidates: Vec<Peekable<Candidates<'a>>> = candidates.collect();
         let (alone, mut used) = (self.classes.len() == 1, Units::new());
@@ -135,7 +135,7 @@ impl<'a> Search<'a> {
                 if amount == left {
                     candidates[class].next();
                 }
-                // Nobody looks at a resource twice that nobody else can select.
+                // With a single class no other requirement examines the resource, so an emptied one need not be counted.
                 if !amount.is_zero() && (amount < left || !alone) {
                     *used.entry(slot).or_default() += amount;
                 }
@@ -144,7 +144,7 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// Moves what others took, where a requirement lacks something that they could have elsewhere.
+    /// Moves amounts that others took, if a requirement lacks something and they can have it elsewhere.
     fn rearrange(&mut self, requirements: &[&Requirement]) {
         let lacking = |class: &Class<'_>| class.members.iter().any(|index| !self.missing[*index].is_zero());
         let family = |class: &Class<'a>| self.resources.family(&class.selector.kind);
@@ -174,7 +174,7 @@ impl<'a> Search<'a> {
         self.place(requirements, &flow, &members);
     }
 
-    /// What was moved is taken from the resources of its nodes; the rest stays where it was taken.
+    /// Places moved amounts on the resources of their nodes; the rest stays where it was taken.
     fn place(&mut self, requirements: &[&Requirement], flow: &Flow, members: &[Vec<usize>]) {
         for index in members.iter().flatten() {
             self.taken[*index].retain(|slot, _| !flow.is_changed_at(*slot));
@@ -189,7 +189,7 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// So much for the requirements of one class, from resources of one node with what is left of each.
+    /// Places an amount for the requirements of one class on the resources of one node; `left` is what is left of each.
     fn place_share(&mut self, members: &[usize], grain: Quantity, amount: Quantity, left: &mut [(Slot, Quantity)]) {
         let (mut amount, mut resources) = (amount, left.iter_mut());
         let mut at = resources.next();
@@ -210,7 +210,7 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// What is available of a resource to the whole request.
+    /// The amount of a resource that is available to the whole request.
     fn available(&self, slot: Slot, resource: &Resource) -> Quantity {
         let of = |units: &Units| units.get(&slot).copied().unwrap_or_default();
         match self.available {
@@ -244,7 +244,7 @@ impl<'a> Search<'a> {
     }
 }
 
-/// The requirements that take something, by what they select.
+/// The requirements that take something, grouped by selector and grain.
 fn classes<'a>(requirements: &[&'a Requirement]) -> Vec<Class<'a>> {
     let mut classes: Vec<Class<'a>> = Vec::new();
     for (index, requirement) in requirements.iter().enumerate().filter(|(_, requirement)| takes(requirement)) {
@@ -266,7 +266,7 @@ pub(crate) fn selects_the_same(one: &Requirement, other: &Requirement) -> bool {
         && one.conditions == other.conditions
 }
 
-/// Whole units, unless a part of one is asked for.
+/// The smallest amount that is taken: whole units, unless a part of a unit is asked for.
 pub(crate) fn grain(requirement: &Requirement) -> Quantity {
     if requirement.count.is_whole() { Quantity::ONE } else { Quantity::from_thousandths(1) }
 }

@@ -1,4 +1,4 @@
-//! Consume, and the end of a task, which gives back what is renewable.
+//! Consume, and the end of a task, which returns renewable units.
 
 use crate::assignment::{Assignment, Available};
 use crate::error::PoolError;
@@ -9,15 +9,15 @@ use crate::resource::Units;
 use ratn_model::resource::{OperatedUnits, Quantity, Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 
-/// Resources of which something returns in one turn.
+/// Maximum number of resources that get units back in one turn.
 const RETURNED_AT_ONCE: usize = 2_000;
 
 impl Pool {
-    /// Uses something up for the rest of the session's task, now or not at all; what waiters have reserved is not taken.
-    /// Returns the ids of the resources consumed from.
+    /// Consumes units for the rest of the session's task, now or not at all; units that waiters have reserved are not taken. Returns the ids of the
+    /// resources from which they were taken.
     ///
     /// # Errors
-    /// An unknown session, another operation than consume, or too little to consume.
+    /// An unknown session, an operation other than consume, or too little to consume.
     pub fn consume(
         &mut self,
         now: Timestamp,
@@ -28,7 +28,7 @@ impl Pool {
         Ok(consumed.into_iter().map(|one| one.resource).collect())
     }
 
-    /// As [`Pool::consume`], of one resource alone.
+    /// As [`Pool::consume`], from one resource only.
     ///
     /// # Errors
     /// As there, and an unknown resource.
@@ -73,7 +73,8 @@ impl Pool {
         Ok(consumed)
     }
 
-    /// So much of a resource as a session has used it up: it returns with the session where it is renewable, and goes with it where it is its own.
+    /// Units of a resource that a session has consumed: they return with the end of the session if the resource is renewable, and vanish then if the
+    /// session owns it.
     pub(crate) fn consumed_units(&self, session: &SessionId, slot: Slot, units: Quantity) -> Option<OperatedUnits> {
         let known = self.resources.get(slot)?;
         let ends_with_session = known.description.renewable || known.owner.as_ref() == Some(session);
@@ -81,8 +82,8 @@ impl Pool {
         Some(OperatedUnits { resource, kind, units, ends_with_session })
     }
 
-    /// The session's task is over: what it consumed of renewable resources returns. Where it is of many, some of it returns: as long as
-    /// the answer is false, call this again.
+    /// The session's task is over: what it consumed of renewable resources returns. If it consumed from many resources, only some of it returns: call
+    /// this again as long as the answer is false.
     ///
     /// # Errors
     /// An unknown or expired session.

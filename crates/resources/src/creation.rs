@@ -1,4 +1,4 @@
-//! Create and delete: what is in the pool.
+//! Create and delete: which resources the pool has.
 
 use crate::caller::Share;
 use crate::error::{ALL, PoolError, check_owner, malformed};
@@ -15,12 +15,12 @@ use ratn_model::value::Value;
 use std::sync::Arc;
 
 impl Pool {
-    /// Adds a resource, bound to a session if one is given. A resource of the same id and owner is updated: the kind
-    /// stays, its attributes and capacity are replaced (holders keep what they hold); where they are equal nothing changes. One of the id that a task has made gives way to a
-    /// provider's: it is deleted, and the leases of it end.
+    /// Adds a resource, bound to a session if one is given. If a resource with the same id and owner exists, it is updated: its kind stays, its
+    /// attributes and capacity are replaced (holders keep what they hold); if they are equal, nothing changes. A resource that a task has made gives
+    /// its id to a provider's resource: it is deleted, and its leases end.
     ///
     /// # Errors
-    /// An unknown session, an id that another owner's resource has and that does not give way, a malformed or too large description.
+    /// An unknown session, the id of another owner's resource that does not give way, or a malformed or too large description.
     pub fn create(
         &mut self,
         now: Timestamp,
@@ -69,9 +69,9 @@ impl Pool {
         self.commit(Effect::ResourceCreated { slot, description, owner, numbered });
     }
 
-    /// Whether a resource is a task's, and gives its id to another of this class: who may create others than a task's is a provider. Nothing
-    /// moves for what a task has made, so that no standstill is lost with it. An operator's stays, and whatever may be an operator's: before
-    /// the first ping after a restart the provider is refused, and asks again. By then its owner has pinged, or has no session any more.
+    /// Whether a task's resource gives its id to a resource of this class: whoever may create other classes than a task's is a provider. Nothing
+    /// moves for a task's resource, so no standstill is lost with it. An operator's resource stays, and so does one that may be an operator's: until
+    /// the owner's first ping after a restart, the provider is refused and asks again. Later the owner has pinged, or has no session any more.
     fn gives_way(&self, resource: &Resource, class: ResourceClass) -> bool {
         let owner = resource.owner.as_ref().and_then(|owner| self.sessions.get(owner));
         resource.description.class == ResourceClass::Task
@@ -79,8 +79,7 @@ impl Pool {
             && owner.is_some_and(Session::is_no_operators)
     }
 
-    /// Removes a resource. Every lease that holds something of it ends as a whole ([`EndReason::ResourceGone`]). `None` as session may delete
-    /// anything.
+    /// Removes a resource. Every lease that holds units of it ends as a whole ([`EndReason::ResourceGone`]). `None` as session may delete anything.
     ///
     /// # Errors
     /// An unknown resource, or one that belongs to another session.
@@ -94,7 +93,7 @@ impl Pool {
         Ok(())
     }
 
-    /// Deletes a resource, when every lease of it has ended.
+    /// Ends all leases of a resource, then deletes it.
     fn remove(&mut self, slot: Slot, reason: EndReason) {
         while let Some(lease) = self.lease_of(slot) {
             self.commit(Effect::LeaseEnded { lease, reason: EndReason::ResourceGone });
@@ -102,17 +101,17 @@ impl Pool {
         self.commit(Effect::ResourceDeleted { slot, reason });
     }
 
-    /// A live lease that holds something of a resource.
+    /// A live lease that holds units of a resource.
     pub(crate) fn lease_of(&self, slot: Slot) -> Option<LeaseId> {
         let holders = self.resources.get(slot)?.holders.iter();
         holders.map(|(lease, _)| *lease).find(|lease| self.leases.contains_key(lease))
     }
 
-    /// Removes so much in all of what is free, fits and may be deleted by its id ([`Pool::delete`]), for good; a resource of which
-    /// nothing is left vanishes. Returns the ids of the resources touched.
+    /// Removes an amount, for good, from the free units of all resources that fit and that the session may delete by id ([`Pool::delete`]); a
+    /// resource with no units left vanishes. Returns the ids of the resources from which units were removed.
     ///
     /// # Errors
-    /// An unknown session, another operation than delete, too little to delete, or enough only with what belongs to another session.
+    /// An unknown session, an operation other than delete, too little to delete, or enough only together with resources of other sessions.
     pub fn delete_units(
         &mut self,
         now: Timestamp,
@@ -123,7 +122,7 @@ impl Pool {
         Ok(deleted.into_iter().map(|one| one.resource).collect())
     }
 
-    /// The same, with the amounts.
+    /// The same; returns the amounts.
     pub(crate) fn take_units(
         &mut self,
         now: Timestamp,
@@ -147,7 +146,7 @@ impl Pool {
                 Err(_) => {}
             }
         }
-        // Its own first: what a session had made is gone with it, and what it had deleted of others' is not there again.
+        // The session's own resources first: they vanish with the session, but others' deleted resources do not come back.
         free.sort_by_key(|(slot, _)| self.resources.get(*slot).is_none_or(|one| one.owner.as_ref() != Some(session)));
         let found: Quantity = free.iter().map(|(_, free)| *free).sum();
         let mut wanted = requirement.count;
@@ -195,7 +194,7 @@ impl Pool {
         }
     }
 
-    /// Whether there may be one more resource of a session when so many have gone; without a session it is an operator's.
+    /// Checks that a session may have one more resource after `gone` others were removed; without a session the resource is an operator's.
     fn check_room(&self, session: Option<&SessionId>, gone: usize) -> Result<(), PoolError> {
         let (limit, there) = (self.limits.resources, self.resources.len() - gone);
         let Some(session) = session.map(|id| self.session(id)).transpose()? else {
@@ -248,8 +247,7 @@ impl Pool {
     }
 }
 
-/// Whether a session may delete a resource, by its id or by what it is: its own, and what belongs to no session. `None` may delete
-/// anything.
+/// Checks that a session may delete a resource, by id or by requirement: its own, and those that belong to no session. `None` may delete anything.
 fn may_delete(resource: &Resource, session: Option<&SessionId>) -> Result<(), PoolError> {
     match (&resource.owner, session) {
         (Some(owner), Some(caller)) => check_owner(|| format!("resource `{}`", resource.description.id), owner, caller),

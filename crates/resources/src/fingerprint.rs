@@ -1,29 +1,28 @@
-//! Fingerprints of requests: two requests of one id are the same if the hash of their contents is.
+//! Fingerprints of requests: two requests with one id are the same if the hashes of their contents are equal.
 //!
-//! It is kept over a restart and over an upgrade, so it must not depend on how records are written. It is of the names of what is asked
-//! and their values, in the order of the names, and what is not said (`None`) is left out: a field that is added, and is left out where
-//! nobody says it, changes nothing for the requests of before.
+//! Fingerprints are kept over restarts and upgrades, so they must not depend on the format of records. The hash covers the names and values of the
+//! request's fields, in the order of names, and omits absent values (`None`). So an added field that is omitted when not used does not change the
+//! fingerprints of older requests.
 
 use crate::queue::AcquireRequest;
 use crate::request::Request;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-/// FNV-1a over 128 bits; clients are not adversaries of themselves. 0 is a fingerprint that is not known: of a version that hashed
-/// something else.
+/// FNV-1a over 128 bits; clients do not attack themselves. 0 is an unknown fingerprint: of a version that hashed something else.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Fingerprint(u128);
 
-/// What is hashed; the number grows when something else is.
+/// First bytes of the hashed content; the number is increased if the content changes.
 const FORM: &[u8] = b"request 1";
 
 struct Fnv(u128);
 
 impl Fingerprint {
-    /// Of what an earlier version remembers in a form of its own: the id alone says that it is the same request.
+    /// For answers of an earlier version with another kind of fingerprint: the id alone says that a request is the same.
     pub(crate) const UNKNOWN: Fingerprint = Fingerprint(0);
 
-    /// Of everything but the deadline of an acquire, which a repeated one has later.
+    /// The fingerprint of a request, without the deadline of an acquire, because a repeated acquire has a later one.
     pub(crate) fn of(request: &Request) -> Fingerprint {
         let said = match request {
             Request::Acquire(acquire) if acquire.deadline.is_some() => {
@@ -33,12 +32,12 @@ impl Fingerprint {
         };
         let mut hash = Fnv(0x6c62_272e_07bb_0142_62b8_2175_6295_c58d);
         hash.bytes(FORM);
-        // Requests have names for all that they say, and nothing else can fail.
+        // All fields of requests have names, and nothing else can make the conversion fail.
         hash.value(&said.unwrap_or_default());
         Fingerprint(hash.0.max(1))
     }
 
-    /// Whether both can be of the same request.
+    /// Whether both may be of the same request.
     pub(crate) fn may_be(self, other: Fingerprint) -> bool {
         self == other || self == Fingerprint::UNKNOWN || other == Fingerprint::UNKNOWN
     }
@@ -76,7 +75,7 @@ impl Fnv {
         self.bytes(bytes);
     }
 
-    /// With how many there are, so that nothing can be read two ways.
+    /// Hashes the length, too, so that the content is unambiguous.
     fn bytes(&mut self, bytes: &[u8]) {
         const PRIME: u128 = 0x0000_0000_0100_0000_0000_0000_0000_013b;
         let length = (bytes.len() as u64).to_le_bytes();
@@ -119,9 +118,9 @@ mod tests {
         Request::Acquire(AcquireRequest { priority: -3, deadline, hold_for, ..request })
     }
 
-    /// These are in the states of installations: another hash refuses the retries of requests from before an upgrade. A field that is
-    /// added is an `Option`, or left out while it is empty. What cannot be so takes another number in [`FORM`] and in the records'
-    /// format, and the old ones are [`Fingerprint::UNKNOWN`] from then on.
+    /// These hashes are in the state of existing installations: another hash would refuse retries of requests from before an upgrade. An added field
+    /// has to be an `Option`, or omitted while it is empty. Otherwise the number in [`FORM`] and the format of the records have to be increased, and
+    /// older fingerprints are [`Fingerprint::UNKNOWN`] from then on.
     #[test]
     fn the_hashes_of_requests_are_those_of_every_version() {
         let hash = |request: &Request| format!("{:032x}", Fingerprint::of(request).0);

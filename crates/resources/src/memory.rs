@@ -1,12 +1,12 @@
 //! Remembered answers, by caller and request id: a request that the same caller repeats under the same id is performed once.
 //!
-//! Bounded by number and by age, and for each caller by number and bytes. A caller's own oldest answers are forgotten first; where all
-//! callers together have too many, those of the caller with the most. So nobody's requests make the manager forget the answers of a caller
-//! with fewer. An answer is durable together with its effect; waiting requests are not.
+//! Bounded by number and by age, and for each caller by number and bytes. A caller's own oldest answers are forgotten first; if all callers together
+//! have too many, those of the caller with the most. So no caller can make the manager forget the answers of a caller with fewer. An answer is
+//! durable together with its effect; waiting requests are not.
 //!
-//! What was done for a session and ended with it (a lease, what it created, what it took of that or consumed of what is renewable) is the answer
-//! of that [`Life`] alone: a session that is opened anew under the same id has it done anew. What outlasts a session is done once for all of
-//! them. What ended in part is refused then: neither would be right.
+//! Effects that ended with a session (a lease, a created resource, a deletion or consumption that returned) are the answer of that [`Life`] only: if
+//! the session is opened again under the same id, the request is performed again. Effects that outlast a session are made once for all its lives. A
+//! request whose effects ended in part is refused then: neither answer would be right.
 
 use crate::error::PoolError;
 use crate::fingerprint::Fingerprint;
@@ -20,19 +20,19 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// What an answer takes besides its texts, in bytes, about.
+/// Approximate size of an answer besides its texts, in bytes.
 const OVERHEAD: usize = 256;
 
-/// A request's id, in the name space of who opened the session that it is for.
+/// A request's id, in the namespace of the caller who opened the session of the request.
 #[derive(Debug, Clone, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct RequestId {
-    /// First, so that the requests of one id stand together.
+    /// First, so that requests with the same id are adjacent.
     pub(crate) id: Arc<str>,
-    /// Empty where nobody knows: whoever asks the same is taken for that caller.
+    /// Empty if unknown: then whoever asks the same counts as that caller.
     pub(crate) caller: Arc<str>,
 }
 
-/// An answer as it is kept: small, with ids instead of what they name.
+/// An answer in its stored form: small, with ids instead of the things themselves.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) enum Remembered {
     Created {
@@ -42,13 +42,13 @@ pub(crate) enum Remembered {
     Granted(LeaseId),
     Touched(Vec<String>),
     Done,
-    /// As [`Remembered::Touched`], where some of it ends with the life and some does not.
+    /// As [`Remembered::Touched`], if some of the effects end with the life and others do not.
     InPart(Vec<String>),
-    /// What was deleted or used up. In answers of before it is one of the two above, without the amounts.
+    /// The units that were deleted or consumed. Answers of earlier versions have one of the two variants above instead, without amounts.
     Operated(Vec<OperatedUnits>),
 }
 
-/// What ends with the session that a request was done for, of what the request did.
+/// Which effects of a request end with the session for which it was performed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Ends {
     Nothing,
@@ -56,7 +56,7 @@ pub(crate) enum Ends {
     All,
 }
 
-/// Which of all sessions, also of those that had one id: its number; 0 is none.
+/// The number of a session among all sessions, including earlier ones with the same id; 0 is none.
 pub(crate) type Life = u64;
 
 /// What a request id leads to.
@@ -66,14 +66,14 @@ pub(crate) enum Recalled {
     Answered(Remembered),
 }
 
-/// How many of their oldest answers these callers lose.
+/// For each of these callers, how many of its oldest answers are forgotten.
 pub(crate) type Forgotten = Vec<(Arc<str>, usize)>;
 
 /// See the module.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct RequestMemory {
     callers: BTreeMap<Arc<str>, OfCaller>,
-    /// When each answer was given and to whom, the oldest first.
+    /// When and to whom each answer was given, oldest first.
     order: BTreeMap<u64, (Timestamp, Arc<str>)>,
     grants: BTreeMap<LeaseId, (Arc<str>, u64)>,
     next: u64,
@@ -84,7 +84,7 @@ pub(crate) struct RequestMemory {
 #[derive(Debug, Clone, Default)]
 struct OfCaller {
     numbers: BTreeMap<Arc<str>, u64>,
-    /// The oldest first.
+    /// Oldest first.
     answers: BTreeMap<u64, Answer>,
     bytes: usize,
 }
@@ -94,7 +94,7 @@ struct Answer {
     id: Arc<str>,
     fingerprint: Fingerprint,
     reply: Remembered,
-    /// With which it ended.
+    /// The session life with which its effect ended; 0 for none.
     life: Life,
 }
 
@@ -109,7 +109,7 @@ impl RequestId {
 }
 
 impl Ends {
-    /// Of several things, whether each ends with the session.
+    /// Combines several effects, given whether each ends with the session.
     pub(crate) fn of(each: &[bool]) -> Ends {
         match (each.contains(&true), each.contains(&false)) {
             (true, true) => Ends::Part,
@@ -118,7 +118,7 @@ impl Ends {
         }
     }
 
-    /// The same of what was deleted or used up.
+    /// The same for deleted or consumed units.
     pub(crate) fn of_units(each: &[OperatedUnits]) -> Ends {
         Ends::of(&each.iter().map(|one| one.ends_with_session).collect::<Vec<_>>())
     }
@@ -138,7 +138,7 @@ impl Remembered {
         }
     }
 
-    /// Whether some of it ends with the life that it was done for and some does not.
+    /// Whether some of the effects end with the life for which they were made and others do not.
     fn ends_in_part(&self) -> bool {
         match self {
             Remembered::InPart(_) => true,
@@ -174,10 +174,11 @@ impl OfCaller {
 }
 
 impl RequestMemory {
-    /// What this request led to before, unless that ended with a life that is over. An answer to nobody knows whom is that of whoever asks the same.
+    /// The result of an earlier request with this id, unless its effect ended with a life that is over. An answer to an unknown caller belongs to
+    /// whoever asks the same.
     ///
     /// # Errors
-    /// Another request of this id, or one of which only a part ended with a life that is over.
+    /// Another request had this id, or only a part of its effects ended with a life that is over.
     pub(crate) fn recall(
         &self,
         id: &RequestId,
@@ -205,12 +206,12 @@ impl RequestMemory {
         waiting.or_else(|| answer().map(|answer| Recalled::Answered(answer.reply.clone())))
     }
 
-    /// What a request was answered, also where that ended with a life that is over.
+    /// The answer to a request, even if its effect ended with a life that is over.
     pub(crate) fn answered(&self, id: &RequestId) -> Option<&Remembered> {
         self.answer(id).or_else(|| self.unknown(id)).map(|answer| &answer.reply)
     }
 
-    /// Who waits under this id: the caller's own waiter, else that of the first caller who has one.
+    /// The waiter with this id: the caller's own, else that of the first caller who has one.
     pub(crate) fn waiter(&self, id: &RequestId) -> Option<WaiterId> {
         let first = RequestId { caller: Arc::default(), ..id.clone() };
         let of_all = self.waiting.range(first..).take_while(|(other, _)| other.id == id.id);
@@ -222,12 +223,12 @@ impl RequestMemory {
         self.waiting.insert(id.clone(), (fingerprint, waiter));
     }
 
-    /// Who waited under this id waits no longer.
+    /// The request with this id does not wait any more.
     pub(crate) fn waited(&mut self, id: &RequestId) -> Option<Fingerprint> {
         self.waiting.remove(id).map(|(fingerprint, _)| fingerprint)
     }
 
-    /// Which answers have to go before one more is remembered.
+    /// The answers to forget before one more is remembered.
     pub(crate) fn too_many(&self, now: Timestamp, limits: &Limits, id: &RequestId, reply: &Remembered) -> Forgotten {
         let for_at_most = Duration::from_millis(limits.remember_for_ms);
         let mut forget: BTreeMap<&Arc<str>, usize> = BTreeMap::new();
@@ -260,7 +261,7 @@ impl RequestMemory {
         forget.into_iter().map(|(caller, count)| (caller.clone(), count)).collect()
     }
 
-    /// Forgets the oldest answers, whosever they are.
+    /// Forgets the oldest answers, of whichever caller.
     pub(crate) fn forget_oldest(&mut self, count: usize) {
         for _ in 0..count {
             let Some((number, (_, caller))) = self.order.pop_first() else { return };
@@ -268,7 +269,7 @@ impl RequestMemory {
         }
     }
 
-    /// Forgets the oldest answers of callers.
+    /// Forgets the oldest answers of these callers.
     pub(crate) fn forget(&mut self, forgotten: &Forgotten) {
         for (caller, count) in forgotten {
             let oldest = self.callers.get(caller).map(|known| known.answers.keys().take(*count).copied().collect());
@@ -297,7 +298,7 @@ impl RequestMemory {
         self.callers.entry(id.caller).or_default().insert(number, Answer { id: id.id, fingerprint, reply, life });
     }
 
-    /// The request that led to this lease is as if it had never been asked; its id.
+    /// Forgets the request that led to this lease, as if it had never been made; returns its id.
     pub(crate) fn forget_grant(&mut self, lease: LeaseId) -> Option<RequestId> {
         let (caller, number) = self.grants.get(&lease).cloned()?;
         let id = self.remove(&caller, number)?;
@@ -321,12 +322,12 @@ impl RequestMemory {
         self.callers.get(&id.caller)?.get(&id.id)
     }
 
-    /// What nobody knows whom was answered under this id.
+    /// The answer under this id to an unknown caller.
     fn unknown(&self, id: &RequestId) -> Option<&Answer> {
         self.callers.get("")?.get(&id.id)
     }
 
-    /// The answers with whom they were given to and the life with which each ended, the oldest first.
+    /// The answers with their callers and session lives, oldest first.
     pub(crate) fn iter(&self) -> impl Iterator<Item = (&Arc<str>, &Arc<str>, Fingerprint, &Remembered, Life)> {
         self.order.iter().filter_map(|(number, (_, caller))| {
             let answer = self.callers.get(caller)?.answers.get(number)?;
@@ -338,7 +339,7 @@ impl RequestMemory {
         self.waiting.len()
     }
 
-    /// Whether the bounds hold, but for a single answer that is larger; and whether the indices say the same as the answers do.
+    /// Checks the bounds, except for a single answer that is larger; and that the indices agree with the answers.
     pub(crate) fn check(&self, limits: &Limits) -> Result<(), &'static str> {
         let ensure = |holds: bool, broken| if holds { Ok(()) } else { Err(broken) };
         ensure(self.order.len() <= limits.remembered_requests.max(1), "the request memory is too long")?;
@@ -367,7 +368,7 @@ impl RequestMemory {
     }
 }
 
-/// Whether both can be of the same request.
+/// Checks that both may be of the same request.
 fn same(id: &RequestId, known: Fingerprint, asked: Fingerprint) -> Result<(), PoolError> {
     if known.may_be(asked) { Ok(()) } else { Err(PoolError::RequestIdReused { id: id.id.to_string() }) }
 }

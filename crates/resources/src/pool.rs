@@ -1,4 +1,4 @@
-//! The pool: its state, requests with their ids, and what can be seen of it.
+//! The pool: its state, requests with ids, and what others can see of it.
 
 use crate::accounts::Accounts;
 use crate::caller::Callers;
@@ -37,14 +37,14 @@ pub struct Pool {
     // What is durable; changed in `apply.rs` only.
     pub(crate) resources: Resources,
     pub(crate) sessions: Sessions,
-    /// For whom the ids of sessions that have ended are kept.
+    /// The callers for whom the ids of ended sessions are kept.
     pub(crate) kept_ids: KeptIds,
     pub(crate) leases: Leases,
-    /// What leases that have ended have left.
+    /// The units that ended leases have left.
     pub(crate) ending: EndingLeases,
-    /// Who has units of a resource with many holders; of the three above.
+    /// Holders of resources with many holders; derived from the fields above.
     pub(crate) crowds: Crowds,
-    /// Leases with consumption that can be taken back, by the resource that was consumed of.
+    /// Leases with consumption that can be taken back, by consumed resource.
     pub(crate) undoable: BTreeMap<Slot, BTreeSet<LeaseId>>,
     pub(crate) memory: RequestMemory,
     pub(crate) revision: Revision,
@@ -56,27 +56,27 @@ pub struct Pool {
     pub(crate) history: History,
     // What is not.
     pub(crate) queue: Queue,
-    /// What each session has had beside others.
+    /// The past use by each session, for fair shares.
     pub(crate) accounts: Accounts,
-    /// Requests whose place others may take.
+    /// Requests that have left the queue and whose place another request may take.
     pub(crate) left: Left,
     /// Request ids whose acquires may arrive after they were withdrawn.
     pub(crate) withdrawals: Withdrawals,
-    /// What providers cannot provide, by kind, and why.
+    /// Why providers cannot provide more of a kind, by session and kind.
     pub(crate) shortages: BTreeMap<SessionId, BTreeMap<String, String>>,
     pub(crate) timers: BTreeSet<(Timestamp, Timer)>,
     pub(crate) next_waiter: u64,
-    /// What each caller has.
+    /// Amounts by caller.
     pub(crate) callers: Callers,
-    /// How fast tokens may grow; as fast as they like where nobody said from where.
+    /// How fast tokens may grow; unbounded if no start value was given.
     pub(crate) pace: Option<Pace>,
-    /// What is due and has not ended yet.
+    /// Timers that are due but not completely handled.
     pub(crate) overdue: BTreeSet<Timer>,
-    /// How much may be done in a turn.
+    /// Limits for the work of a turn.
     pub(crate) work: Work,
-    /// How much was done in this turn, counted in resources that were looked at.
+    /// Work done in this turn, counted in examined resources.
     pub(crate) worked: usize,
-    /// With so much the rest is left to the next turn.
+    /// At this amount of work the rest is left to the next turn.
     pub(crate) enough: usize,
     pub(crate) notices: Vec<Notice>,
     pub(crate) records: Vec<Record>,
@@ -90,7 +90,7 @@ impl Pool {
         pool
     }
 
-    /// The same pool, in which who asks for a kind may get one of a kind below it. Nobody may wait yet.
+    /// The same pool with a hierarchy of kinds: a request for a kind may get a resource of a subclass. No request may wait yet.
     #[must_use]
     pub fn with_kinds(mut self, kinds: Kinds) -> Pool {
         debug_assert!(self.queue.len() == 0, "waiters are in families of the kinds of before");
@@ -99,9 +99,9 @@ impl Pool {
         self
     }
 
-    /// The same pool; what it grants from now on has ids and tokens above `floor` too, and the sessions that it opens have such numbers. A restarted manager passes the microseconds
-    /// of a clock, so that its leases are not refused as old ones, whatever was lost of what it kept: tokens do not grow faster
-    /// than those (`pace.rs`).
+    /// The same pool; ids and tokens of later grants, and numbers of later sessions, are above `floor`. A restarted manager passes the microseconds
+    /// of a clock, so that its leases are not refused as old ones even if some of its state was lost: tokens do not grow faster than the clock
+    /// (`pace.rs`).
     #[must_use]
     pub fn above(mut self, floor: u64) -> Pool {
         for last in [&mut self.last_lease, &mut self.last_token, &mut self.last_session, &mut self.next_waiter] {
@@ -111,8 +111,8 @@ impl Pool {
         self
     }
 
-    /// The same pool, restored from a log whose end may be lost: revisions are above `floor` from now on, so that none means two
-    /// things, and who watched before is told to begin anew.
+    /// The same pool, restored from a log whose end may be lost: later revisions are above `floor`, so that no revision means two things, and earlier
+    /// watchers are told to begin anew.
     #[must_use]
     pub fn with_revisions_above(mut self, floor: Revision) -> Pool {
         if floor > self.revision {
@@ -121,8 +121,7 @@ impl Pool {
         self
     }
 
-    /// From now on other bounds hold; what is there beyond them stays. Who may be served with wider ones is, by the next
-    /// [`Pool::advance`].
+    /// Sets other limits; what exceeds them stays. Requests that can be served under wider limits are served by the next [`Pool::advance`].
     pub fn set_limits(&mut self, limits: Limits) {
         self.resources.set_max_holders(limits.holders);
         if limits.holders > self.limits.holders {
@@ -132,7 +131,7 @@ impl Pool {
         self.limits = limits;
     }
 
-    /// How many resources, sessions, leases and waiters there are.
+    /// The numbers of resources, sessions, leases and waiters.
     pub fn amounts(&self) -> [usize; 4] {
         [self.resources.len(), self.sessions.len(), self.leases.len(), self.queue.len()]
     }
@@ -145,12 +144,12 @@ impl Pool {
         self.handle_as(now, &Speaker::trusted(), request_id, request)
     }
 
-    /// Performs a mutation that a speaker asks for who may speak for its session ([`Pool::check_speaker`]). With a request id, an equal
-    /// request of that id answered before is not performed again: its answer is given once more. Request ids are of who opened the
-    /// session, or of the speaker where it is not there. What ended with a session is performed anew for one that was opened anew under its id.
+    /// Performs a mutation for a speaker who may use its session ([`Pool::check_speaker`]). If an equal request with the same request id was answered
+    /// before, it is not performed again: its answer is repeated. Request ids belong to the caller who opened the session, or to the speaker if the
+    /// session does not exist. Effects that ended with a session are made anew if the session was opened again under its id.
     ///
     /// # Errors
-    /// As the method of the same name; nothing has changed then, and the id is not used up.
+    /// As for the method of the same name; then nothing has changed, and the id is not used up.
     pub fn handle_as(
         &mut self,
         now: Timestamp,
@@ -170,7 +169,7 @@ impl Pool {
         match self.memory.recall(&id, fingerprint, self.is_over(life))? {
             Some(Recalled::Waiting(waiter)) => Ok(Reply::Queued(waiter)),
             Some(Recalled::Answered(Remembered::Granted(lease))) => {
-                // Of another session: only the id is known of what an earlier version remembers.
+                // The lease is of another session: an earlier version remembers only the id of a request.
                 if self.leases.get(&lease).is_some_and(|known| Some(&known.session) != request.session()) {
                     return Err(PoolError::RequestIdReused { id: request_id.to_owned() });
                 }
@@ -190,9 +189,9 @@ impl Pool {
                 }
                 let (reply, ends) = reply?;
                 let remembered = match &reply {
-                    // Remembered by the grant, which may be long after this or was within it.
+                    // Remembered by the grant, which may come much later or was just made.
                     Reply::Queued(_) | Reply::Granted(_) => return Ok(reply),
-                    // By its last part.
+                    // Remembered by its last part.
                     Reply::Unfinished => return Ok(reply),
                     Reply::Created { id, revision } => Remembered::Created { id: id.clone(), revision: *revision },
                     Reply::Operated(units) => Remembered::Operated(units.clone()),
@@ -205,12 +204,12 @@ impl Pool {
         }
     }
 
-    /// What a request for a session was answered, also where that ended with an earlier session of the same id; nothing where it was never performed,
-    /// or that is forgotten: of one caller the oldest answers are forgotten first, so where an older one is known it was not. Of an acquire that was
-    /// granted it is [`Reply::Done`].
+    /// The answer to an earlier request for a session, even if its effect ended with an earlier session of the same id. `None` if the request was
+    /// never performed, or its answer is forgotten: a caller's oldest answers are forgotten first, so if an older one is known, it was never
+    /// performed. For a granted acquire the answer is [`Reply::Done`].
     ///
     /// # Errors
-    /// A session that another opened.
+    /// Another caller opened the session.
     pub fn recall(
         &mut self,
         now: Timestamp,
@@ -223,18 +222,18 @@ impl Pool {
         Ok(self.memory.answered(&id).cloned().map(replied))
     }
 
-    /// Who is answered: the opener of the session, where that is there.
+    /// The caller to answer: the opener of the session if that exists, else the speaker.
     fn caller_of<'a>(&'a self, session: Option<&SessionId>, speaker: &'a Speaker) -> &'a Arc<str> {
         let session = session.and_then(|session| self.sessions.get(session));
         session.map_or(&speaker.name, |session| &session.opened_by)
     }
 
-    /// How much of what fits exists and is not consumed, held or not (the paper's `exists`).
+    /// The amount of fitting resources that exists and is not consumed, held or not (the paper's `exists`).
     pub fn exists(&self, requirement: &Requirement) -> Quantity {
         self.resources.quantity(requirement)
     }
 
-    /// The ids of what fits a requirement, in order.
+    /// The ids of the resources that fit a requirement, sorted.
     pub fn fitting(&self, requirement: &Requirement) -> Vec<String> {
         let mut ids: Vec<String> =
             self.resources.fitting(requirement).map(|(_, resource)| resource.description.id.clone()).collect();
@@ -248,12 +247,12 @@ impl Pool {
         self.resources.get(slot).map(|resource| self.view_of((slot, resource)))
     }
 
-    /// Every resource, in the order of ids.
+    /// Every resource, sorted by id.
     pub fn list(&self) -> Vec<ResourceView> {
         self.resources.iter().map(|one| self.view_of(one)).collect()
     }
 
-    /// At most so many resources behind an id, in the order of ids; from the first one behind the empty id.
+    /// At most `most` resources after an id, sorted by id; from the first one if the id is empty.
     pub fn list_after(&self, id: &str, most: usize) -> Vec<ResourceView> {
         self.resources.after(id).take(most).map(|one| self.view_of(one)).collect()
     }
@@ -262,7 +261,7 @@ impl Pool {
         resource.view(self.holders(slot, resource))
     }
 
-    /// Every live lease, in the order of ids.
+    /// Every live lease, sorted by id.
     pub fn leases(&self) -> Vec<LeaseView> {
         let view = |(id, record): (&LeaseId, &crate::lease::LeaseRecord)| LeaseView {
             id: *id,
@@ -275,56 +274,56 @@ impl Pool {
         self.leases.iter().map(view).collect()
     }
 
-    /// The lease that was granted last, living or not; ids grow.
+    /// The lease that was granted last, live or ended; ids grow.
     pub fn youngest_lease(&self) -> LeaseId {
         LeaseId(self.last_lease)
     }
 
-    /// The queue, in the order in which it is served.
+    /// The queue, in the order of service.
     pub fn waiters(&self) -> Vec<(WaiterId, AcquireRequest)> {
         self.queue.iter().map(|(id, waiter)| (id, waiter.request.clone())).collect()
     }
 
-    /// The waiter of a request id, if it waits: the caller's own, else one of another caller.
+    /// The waiter of a request id, if there is one: the caller's own, else that of another caller.
     pub fn waiter_of(&self, caller: &Arc<str>, request_id: &str) -> Option<WaiterId> {
         self.memory.waiter(&RequestId::new(caller, request_id))
     }
 
-    /// The request id of a waiter, empty where it has none, and what it asked for.
+    /// The request id of a waiter (empty if it has none) and its request.
     pub fn waiter(&self, id: WaiterId) -> Option<(&str, &AcquireRequest)> {
         self.queue.get(id).map(|waiter| (&*waiter.request_id.id, &waiter.request))
     }
 
-    /// The first of the queue, in the order in which it is served.
+    /// The first waiters of the queue, in the order of service.
     pub fn first_waiters(&self, count: usize) -> Vec<WaiterId> {
         self.queue.iter().take(count).map(|(id, _)| id).collect()
     }
 
-    /// How many wait.
+    /// Number of waiters.
     pub fn waiting(&self) -> usize {
         self.queue.len()
     }
 
-    /// How many events there were so far; the next one has this revision plus one.
+    /// Number of events so far; the next one has this revision plus one.
     pub fn revision(&self) -> Revision {
         self.revision
     }
 
-    /// What happened after a revision, in order and without a gap.
+    /// The events after a revision, in order and without a gap.
     ///
     /// # Errors
-    /// Where that is not known any more (or not yet).
+    /// If these events are not kept any more (or the revision is yet to come).
     pub fn changes_after(&self, revision: Revision) -> Result<Vec<Arc<WatchEvent>>, Compacted> {
         self.history.after(revision, self.revision)
     }
 
-    /// What happened since the last call, in order.
+    /// The notices since the last call, in order.
     pub fn take_notices(&mut self) -> Vec<Notice> {
         std::mem::take(&mut self.notices)
     }
 
-    /// The durable changes since the last call, in order. They have to be on the disk before anything that was answered or
-    /// noticed since then goes out; together they are one entry ([`crate::encode`]), so that none is there without the rest.
+    /// The durable changes since the last call, in order. They have to be on disk before any answer or notice since then is sent; together they are
+    /// one entry ([`crate::encode`]), so that none is stored without the rest.
     pub fn take_records(&mut self) -> Vec<Record> {
         std::mem::take(&mut self.records)
     }
@@ -333,18 +332,18 @@ impl Pool {
         self.resources.get(slot).map(|resource| resource.description.id.clone())
     }
 
-    /// Which life of a session it is now; 0 where it is not there.
+    /// The number of the present session with this id; 0 if there is none.
     pub(crate) fn life(&self, session: Option<&SessionId>) -> Life {
         session.and_then(|session| self.session_number(session)).unwrap_or(0)
     }
 
-    /// Whether a life is over, for who asks in a session of this life; for who asks in none that is there none is.
+    /// Whether a session life is over, for a caller in a session of life `asks`; for a caller without a session no life is over.
     pub(crate) fn is_over(&self, asks: Life) -> impl Fn(Life) -> bool {
         let lives = |life| self.sessions.values().any(|session| session.number == life && session.ending.is_none());
         move |life| ![0, asks].contains(&life) && asks != 0 && !lives(life)
     }
 
-    /// Keeps the answer to a request id, together with its effect, which ends with a life unless that is 0.
+    /// Keeps the answer to a request id, together with its effect, which ends with the session life unless that is 0.
     pub(crate) fn remember(&mut self, id: RequestId, fingerprint: Fingerprint, reply: Remembered, life: Life) {
         if !id.is_empty() {
             let forget = self.memory.too_many(self.now, &self.limits, &id, &reply);
@@ -356,7 +355,7 @@ impl Pool {
         }
     }
 
-    /// The reply, and what of what was done ends with the session that it was done for.
+    /// Performs a request; returns the reply, and which of its effects end with its session.
     fn perform(
         &mut self,
         now: Timestamp,
@@ -402,7 +401,7 @@ impl Pool {
     }
 }
 
-/// As it is told. Whoever asks for a grant once more is told of its lease elsewhere.
+/// The answer in its reply form. A repeated request for a grant gets its lease elsewhere.
 fn replied(answered: Remembered) -> Reply {
     match answered {
         Remembered::Created { id, revision } => Reply::Created { id, revision },

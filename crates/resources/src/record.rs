@@ -1,9 +1,9 @@
 //! Records of changes: every durable change is one of these records, applied by
 //! `apply.rs`, both when it happens and when it is read back.
 //!
-//! Records are physical (which slot, which amount, which token), never "what was asked": nothing is decided again when they
-//! are read. The records of one call belong together, the answer remembered for its request id among them:
-//! [`encode`] makes them one entry of a log. Waiters are not in them; their clients ask again with the same request id.
+//! Records are physical (which slot, which amount, which token), never the request itself: nothing is decided again when they are read. The records
+//! of one call belong together, including the answer remembered for its request id: [`encode`] makes them one entry of a log. Waiters are not
+//! recorded; their clients ask again with the same request id.
 
 use crate::event::EndReason;
 use crate::fingerprint::Fingerprint;
@@ -18,12 +18,12 @@ use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The version that [`encode`] writes, its first byte. Every new variant at the end takes a new number, so that an older program
-/// refuses what it does not know by its version; records since [`OLDEST_FORMAT`] are read as they are.
+/// The version that [`encode`] writes as the first byte. Every new variant is added at the end and increases the number, so that an older program
+/// refuses records that it does not know; records since [`OLDEST_FORMAT`] are read unchanged.
 pub const FORMAT: u8 = 12;
-/// The oldest version that [`decode`] reads: it has no `Effect::SessionOpened`, as none before this one has `Effect::UnitsFreed`.
+/// The oldest version that [`decode`] reads: it has no `Effect::SessionOpened`, and versions before this one have no `Effect::UnitsFreed`.
 pub const OLDEST_FORMAT: u8 = 2;
-/// The newest version whose fingerprints are of how requests were written then, which says nothing to a later one.
+/// The newest version whose fingerprints hash the bytes of requests; later versions cannot compare them.
 const BYTE_FINGERPRINTS: u8 = 3;
 
 /// One durable change of a pool.
@@ -32,33 +32,33 @@ pub struct Record(pub(crate) Effect);
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) enum Effect {
-    /// A session lives for another time from now on. In records of [`OLDEST_FORMAT`] it may be new: who opened it is not known.
+    /// A session lives for another `ttl` from now. In records of [`OLDEST_FORMAT`] it may be new: then its opener is unknown.
     SessionKept { session: SessionId, client: String, ttl: Duration },
-    /// A session is gone; what hung on it went before.
+    /// A session is gone; everything that belonged to it was removed before.
     SessionEnded { session: SessionId },
-    /// A resource is new. `numbered` is the last number given to a resource without an id of its own.
+    /// A resource is new. `numbered` is the last number given to a resource without an id.
     ResourceCreated { slot: Slot, description: Arc<Description>, owner: Option<SessionId>, numbered: u64 },
-    /// A resource has another description.
+    /// A resource has a new description.
     ResourceUpdated { slot: Slot, description: Arc<Description> },
     /// A resource is gone; its holders have lost it.
     ResourceDeleted { slot: Slot, reason: EndReason },
     /// A session has consumed some of a resource.
     Consumed { session: SessionId, slot: Slot, amount: Quantity },
-    /// What a session has consumed of what is renewable returned.
+    /// The renewable units that a session has consumed have returned.
     TaskEnded { session: SessionId },
     /// A lease began.
     LeaseGranted { lease: LeaseId, granted: LeaseRecord },
     /// A lease ended.
     LeaseEnded { lease: LeaseId, reason: EndReason },
-    /// In records of before: a request id has its answer, given to nobody knows whom; the oldest `forget` answers were forgotten for it.
+    /// In older records: a request id has its answer, to an unknown caller; the oldest `forget` answers were forgotten for it.
     Answered { request_id: String, fingerprint: Fingerprint, reply: Remembered, forget: usize },
-    /// What a session consumed of a resource with a grant that was undone is there again.
+    /// Units that a session consumed with an undone grant have returned.
     Returned { session: SessionId, slot: Slot, amount: Quantity },
-    /// In records of before: a session without a number is new.
+    /// In older records: a session without a number is new.
     SessionOpened { session: SessionId, client: String, ttl: Duration, opened_by: Arc<str> },
-    /// What a lease that has ended had left of a resource is free: standstill was confirmed, or its bound has passed.
+    /// The units of a resource that an ended lease had left are free: standstill was confirmed, or its bound has passed.
     UnitsFreed { lease: LeaseId, slot: Slot, confirmed: bool },
-    /// A request id of a caller has its answer; so many of the oldest answers of these callers were forgotten for it.
+    /// A request id of a caller has its answer; these callers have lost some of their oldest answers for it.
     AnsweredTo {
         caller: Arc<str>,
         request_id: Arc<str>,
@@ -68,11 +68,11 @@ pub(crate) enum Effect {
     },
     /// A session is new.
     SessionNumbered { session: SessionId, client: String, ttl: Duration, opened_by: Arc<str>, number: u64 },
-    /// Of what a session has consumed of what is renewable, so much returned as it has of the first so many resources.
+    /// The renewable units that a session has consumed from its first `resources` consumed resources have returned.
     SomeReturned { session: SessionId, resources: usize },
-    /// Revisions go on from here: those before it may have meant something else.
+    /// Revisions continue from here: those before may have had another meaning.
     RevisionsLeapt { revision: Revision },
-    /// As `AnsweredTo`, of what ends with the session of this number.
+    /// As `AnsweredTo`, for effects that end with the session of this number.
     AnsweredForLife {
         caller: Arc<str>,
         request_id: Arc<str>,
@@ -83,7 +83,7 @@ pub(crate) enum Effect {
     },
 }
 
-/// What its bytes are, in messages.
+/// The name of this format in messages.
 const RECORDS: &str = "records of a resource pool";
 
 /// The records of one call, as one entry of a log.
@@ -94,7 +94,7 @@ pub fn encode(records: &[Record]) -> Vec<u8> {
 /// Reads what [`encode`] wrote.
 ///
 /// # Errors
-/// Bytes that it did not write, or another version did.
+/// The bytes are not from it, or from another version.
 pub fn decode(bytes: &[u8]) -> Result<Vec<Record>, DecodeError> {
     let version = versioned::version(OLDEST_FORMAT, FORMAT, RECORDS, bytes)?;
     let mut records: Vec<Record> = versioned::decode(version, RECORDS, bytes)?;
@@ -108,7 +108,7 @@ pub fn decode(bytes: &[u8]) -> Result<Vec<Record>, DecodeError> {
     Ok(records)
 }
 
-/// Whether the fingerprints in bytes of this version are those of this program.
+/// Whether the fingerprints in this version are computed as in this program.
 pub(crate) fn knows_fingerprints(version: u8) -> bool {
     version > BYTE_FINGERPRINTS
 }

@@ -1,4 +1,4 @@
-//! Mutations as values, so that each can carry a request id: the same id twice is performed once.
+//! Mutations as values, so that each can carry a request id: a repeated id is performed only once.
 
 use crate::id::{SessionId, WaiterId};
 use crate::queue::AcquireRequest;
@@ -12,51 +12,51 @@ use serde::{Deserialize, Serialize};
 pub enum Request {
     /// See [`crate::Pool::create`].
     Create {
-        /// With which it vanishes.
+        /// The session with which the resource vanishes.
         session: Option<SessionId>,
-        /// What.
+        /// The resource.
         spec: ResourceSpec,
     },
     /// See [`crate::Pool::delete`].
     Delete {
-        /// Who asks; `None` may delete anything.
+        /// The session that asks; `None` may delete anything.
         session: Option<SessionId>,
-        /// Which.
+        /// The resource's id.
         id: String,
     },
     /// See [`crate::Pool::delete_units`].
     DeleteUnits {
-        /// Who asks.
+        /// The session that asks.
         session: SessionId,
-        /// What.
+        /// The resources.
         requirement: Requirement,
     },
     /// See [`crate::Pool::consume`] and [`crate::Pool::consume_of`].
     Consume {
-        /// Who asks.
+        /// The session that asks.
         session: SessionId,
-        /// What.
+        /// The amount and kind.
         requirement: Requirement,
-        /// Of this resource alone.
+        /// Only from this resource, if set.
         resource: Option<String>,
     },
     /// See [`crate::Pool::acquire`].
     Acquire(AcquireRequest),
     /// See [`crate::Pool::release`].
     Release {
-        /// Who asks; `None` may release anything.
+        /// The session that asks; `None` may release anything.
         session: Option<SessionId>,
-        /// Which.
+        /// The lease.
         lease: LeaseId,
     },
     /// See [`crate::Pool::end_task`].
     EndTask {
-        /// Whose.
+        /// The session whose task ends.
         session: SessionId,
     },
     /// See [`crate::Pool::confirm_standstill`].
     ConfirmStandstill {
-        /// Whose resource it is; `None` may confirm for any provider.
+        /// The session that provides the resource; `None` may confirm for any provider.
         session: Option<SessionId>,
         /// The lease that has ended.
         lease: LeaseId,
@@ -66,7 +66,7 @@ pub enum Request {
 }
 
 impl Request {
-    /// The session that it is made for; without one it is an operator's.
+    /// The session for which it is made; without one it is an operator's.
     pub fn session(&self) -> Option<&SessionId> {
         match self {
             Request::Create { session, .. }
@@ -84,25 +84,24 @@ impl Request {
 /// The answer to a [`Request`].
 #[derive(Debug, Clone, PartialEq)]
 pub enum Reply {
-    /// To a create: the resource's id, and the pool's revision with it. It may have changed or gone since, where the
-    /// request is a repeated one.
+    /// To a create: the resource's id, and the pool's revision after it. The resource may have changed or gone since if the request is a repeated one.
     Created {
         /// Its id.
         id: String,
         /// The revision.
         revision: Revision,
     },
-    /// To an acquire: it is in the queue; a [`crate::Notice`] will tell how it ends.
+    /// To an acquire: it is in the queue; a [`crate::Notice`] will report its end.
     Queued(WaiterId),
     /// To an acquire repeated after it was granted.
     Granted(Lease),
-    /// To a consume or a delete of units: what of which resources.
+    /// To a consume or a delete of units: the units of each resource.
     Operated(Vec<OperatedUnits>),
-    /// To a confirmation of standstill: the resource, if units of it became free by it. To a consume or a delete of units that an earlier version
-    /// performed: the ids of the resources.
+    /// To a confirmation of standstill: the resource, if units of it became free. To a consume or a delete of units by an earlier version: the ids of
+    /// the resources.
     Touched(Vec<String>),
-    /// To the end of a task with much to return: some of it has. The same request once more goes on with it.
+    /// To the end of a task with much to return: some of it has returned. Repeat the same request to continue.
     Unfinished,
-    /// To the rest.
+    /// To all other requests.
     Done,
 }

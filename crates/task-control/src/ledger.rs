@@ -1,5 +1,5 @@
-//! What a run has asked for and has not been answered yet, folded from its events and commands: what has to be asked again when
-//! task control was killed. A pure fold; what is done with it is [`super::resume`]'s.
+//! The open items of a run: what it has asked for and has not been answered yet, folded from its events and commands. After task control was killed,
+//! they are asked again. A pure fold; [`super::resume`] acts on it.
 
 mod account;
 mod beginnings;
@@ -19,17 +19,17 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// A checkpoint keeps so many commits although the world pool has confirmed them: one that was killed without durable storage may have lost the
-/// last ones, and they are then repeated.
+/// Number of commits that a checkpoint keeps although the world pool has confirmed them: a world pool that is killed without durable storage may lose
+/// its last ones, and they are then repeated.
 const KEPT: usize = 256;
-/// A checkpoint keeps so many of the last withdrawn requests. An older one was answered long ago: the resource manager lets no
-/// session wait for more at a time (`waiters_per_session`).
+/// Number of withdrawn requests that a checkpoint keeps, the last ones. Older ones were answered long ago: the resource manager lets no session wait
+/// for more at a time (`waiters_per_session`).
 const KEPT_WITHDRAWN: usize = 4096;
 
-/// So many of the leases that the run was about to give back last are kept: older ones are back.
+/// Number of leases to keep that the run was about to give back last: older ones have been given back.
 const KEPT_RETURNED: usize = 256;
 
-/// So many goals that were told to stop are kept: more have not ended at a time, as each has a few seconds for that.
+/// Number of cancelled goals to keep: no more can be unfinished at a time, because each has a few seconds to end.
 const KEPT_STOPPED: usize = 64;
 
 /// The open items of a run.
@@ -38,51 +38,51 @@ pub(super) struct Ledger {
     pub(super) origin: Origin,
     /// The root's revision when the run began.
     pub(super) first_revision: Revision,
-    /// The root's revision of which the run has heard last: what others had made up to it is in its world.
+    /// The latest root revision that the run has heard of: its world contains what others had committed up to it.
     pub(super) knows: Revision,
-    /// How what is under way began.
+    /// How the instances and composite states under way began.
     pub(super) beginnings: Beginnings,
-    /// The first operation that failed, by its number: neither that one nor anything behind it is made.
+    /// The number of the first operation that failed: neither it nor anything behind it is performed.
     pub(super) failed: Option<u64>,
-    /// The number of the run's session: what it has made and holds is in that one. A session of its id that has another number was opened by
-    /// a resumption that died before it had made anything so again.
+    /// The number of the run's session, in which it has created and holds its resources. A session with the run's id and another number was opened by
+    /// a resumption that died before it had recreated anything.
     pub(super) session: u64,
-    /// The last operation that is done in that session, by its number.
+    /// The number of the last operation that is done in that session.
     pub(super) recorded: u64,
     /// When the last event came.
     pub(super) last: Timestamp,
-    /// How often task control has come back so far.
+    /// How often the run has been resumed so far.
     pub(super) resumptions: u32,
     /// Numbers of acquires and of operations so far; they are part of request ids.
     pub(super) acquires: u64,
     pub(super) operations: u64,
     /// Acquires without an answer.
     pub(super) waiting: BTreeMap<InstanceId, Asked>,
-    /// Request ids of acquires that were withdrawn, or asked for again, without an answer: a grant may have crossed.
+    /// Request ids of acquires that were withdrawn, or repeated, without an answer: a grant may have crossed.
     pub(super) withdrawn: Vec<String>,
-    /// Leases that were granted and not given back, with what they consumed beside.
+    /// Leases that were granted and not given back.
     pub(super) held: BTreeSet<LeaseId>,
-    /// The last leases that were to go back. Whether they have is not known.
+    /// The last leases that the run was about to give back. Whether it did is unknown.
     pub(super) returned: Vec<LeaseId>,
-    /// Which of them were to go back behind which commit: without those that are confirmed.
+    /// The leases among them that were to be given back while a commit was unconfirmed.
     pub(super) went_back: Vec<WentBack>,
-    /// What the run has made and used up in its session.
+    /// What the run has created and used up in its session.
     pub(super) account: Account,
-    /// The last requests that the resource manager has answered: one of these, as far as the log says.
+    /// Possible ids of the last request that the resource manager has answered, as far as the log says.
     pub(super) answered: Vec<String>,
-    /// The last lease that it has granted.
+    /// The last lease that the resource manager has granted.
     pub(super) youngest_lease: LeaseId,
     /// Projections that were asked for.
     pub(super) projecting: BTreeMap<InstanceId, Projecting>,
     /// Goals under way.
     pub(super) goals: BTreeMap<InstanceId, (u32, Goal)>,
-    /// The last goals that were told to stop. Whether they were told, and have ended, is not known.
+    /// The last goals that were cancelled. Whether the cancels arrived, and whether the goals have ended, is unknown.
     pub(super) stopped: Vec<(InstanceId, u32, Goal)>,
-    /// Every commit, in order, without those that were forgotten.
+    /// Every commit, in order, except those that were forgotten.
     pub(super) commits: Vec<Decided>,
-    /// How many commits were forgotten, all older than the others: see [`Ledger::forget`].
+    /// Number of forgotten commits, all older than the kept ones: see [`Ledger::forget`].
     pub(super) forgotten: u64,
-    /// What was created, deleted and consumed at retirements and may not be done in the run's session, in order.
+    /// Creates, deletes and consumes of retirements that are perhaps not done in the run's session, in order.
     pub(super) operated: Vec<Operated>,
     /// When the executive wants to be woken.
     pub(super) wakes: BTreeSet<Timestamp>,
@@ -90,18 +90,18 @@ pub(super) struct Ledger {
     pub(super) ended: Option<String>,
 }
 
-/// What a retirement creates, deletes and consumes.
+/// The creates, deletes and consumes of a retirement.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Operated {
-    /// Among all operations of the run.
+    /// Its number among all operations of the run.
     pub(super) number: u64,
     pub(super) instance: InstanceId,
     pub(super) operations: Vec<Requirement>,
-    /// Requests that the resource manager has answered before it was asked for this.
+    /// Requests that the resource manager had answered before this operation was requested.
     pub(super) older: Vec<String>,
 }
 
-/// A lease that was to go back, while a commit may have been on its way.
+/// A lease that was to be given back while a commit may have been under way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct WentBack {
     pub(super) lease: LeaseId,
@@ -110,21 +110,21 @@ pub(super) struct WentBack {
     pub(super) at: Timestamp,
 }
 
-/// How far the daemons have confirmed what the run has decided, which they do in order.
+/// How far the daemons have confirmed what the run has decided; they perform it in order.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Confirmed {
-    /// The world pool, by the revision of a commit.
+    /// The revision of the last commit that the world pool has confirmed.
     pub(super) commit: Revision,
-    /// The resource manager, by the number of an operation.
+    /// The number of the last operation that the resource manager has confirmed.
     pub(super) operation: u64,
-    /// Of what was decided by this instance the first failed, and what that was.
+    /// The instance whose commit or operation failed first, and what was not made.
     pub(super) failed: Option<(InstanceId, Unmade)>,
 }
 
 /// An acquire.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Asked {
-    /// Its request id, as sent last.
+    /// Its request id, as last sent.
     pub(super) request: String,
     pub(super) number: u64,
     pub(super) requirements: Vec<Requirement>,
@@ -140,20 +140,20 @@ pub(super) struct Projecting {
     pub(super) writers: Vec<Arc<str>>,
     pub(super) reads: Footprint,
     pub(super) lease: Option<(LeaseId, FencingToken)>,
-    /// Whether its goal begins only when it is there.
+    /// Whether the goal begins only when the projection exists.
     pub(super) first: bool,
-    /// The id under which its goal was given, where it was perhaps not there yet.
+    /// The id with which the goal was started, perhaps before the projection existed.
     pub(super) named: Option<ProjectionId>,
 }
 
-/// The request id of an acquire. Asked for again after task control was gone, it is another request: whatever the first one
-/// was granted meanwhile went back.
+/// The request id of an acquire. If it is repeated after a restart of task control, it is a new request: whatever the first one was granted meanwhile
+/// is given back.
 pub(super) fn acquire_request(run: &str, instance: InstanceId, number: u64, resumptions: u32) -> String {
     let again = if resumptions > 0 { format!("+{resumptions}") } else { String::new() };
     format!("{run}/{instance}/acquire-{number}{again}")
 }
 
-/// The id of the request that is made when that one has waited too long beside other runs.
+/// The id of the request that replaces this one when it has waited too long beside other runs.
 pub(super) fn late_request(request: &str) -> String {
     format!("{request}/late")
 }
@@ -163,13 +163,13 @@ pub(super) fn operation_request(run: &str, instance: InstanceId, number: u64, in
     format!("{run}/{instance}/operate-{number}.{index}")
 }
 
-/// The request id of the resource that says that a run is under way, in a session that it has opened.
+/// The request id of the resource that marks a run as under way, in a session that the run has opened.
 pub(super) fn claim_request(run: &str, session: u64) -> String {
     format!("{run}/claim-{session}")
 }
 
 impl Ledger {
-    /// An event that the executive was given.
+    /// Follows an event that was given to the executive.
     pub(super) fn event(&mut self, at: Timestamp, event: &Event) {
         self.last = self.last.max(at);
         self.beginnings.event(event, self.knows);
@@ -198,10 +198,10 @@ impl Ledger {
             Event::Woken => self.wakes = self.wakes.split_off(&Timestamp(at.0.saturating_add(1))),
             Event::Granted { instance, lease } => {
                 self.held.insert(lease.id);
-                // The run has handed it over itself.
+                // The run itself has handed the lease over.
                 self.went_back.retain(|one| one.lease != lease.id);
                 let asked = self.waiting.remove(instance);
-                // One that was handed over is not younger than all.
+                // A lease that was handed over may be older than others.
                 if let Some(asked) = asked.filter(|_| lease.id > self.youngest_lease) {
                     self.youngest_lease = lease.id;
                     self.account.granted(&asked.requirements, lease);
@@ -213,13 +213,13 @@ impl Ledger {
             }
             Event::RetirementFailed { instance, unmade, .. } => self.failed(*instance, *unmade),
             Event::Projected { instance, attempt, projection } => {
-                // What need not be there first is perhaps only promised.
+                // A projection that need not exist before its goal starts may only be promised.
                 self.projecting.retain(|id, asked| id != instance || asked.attempt != *attempt || !asked.first);
                 if let Some(asked) = self.projecting.get_mut(instance).filter(|asked| asked.attempt == *attempt) {
                     asked.named = Some(*projection);
                 }
             }
-            // What is called so may go on, and is told to stop then.
+            // The goal of a crashed attempt may go on; it is cancelled then.
             Event::Crashed { instance, attempt, .. } => {
                 self.stops(*instance, *attempt);
                 self.projecting.retain(|id, asked| id != instance || asked.attempt != *attempt);
@@ -232,7 +232,7 @@ impl Ledger {
         }
     }
 
-    /// A command that it gave.
+    /// Follows a command of the executive.
     pub(super) fn command(&mut self, command: &Command) {
         match command {
             Command::Acquire { instance, requirements, priority } => {
@@ -300,21 +300,21 @@ impl Ledger {
         self.beginnings.command(command, self.knows);
     }
 
-    /// What the run held is gone. Of what was lost before, others' changes count since then.
+    /// The run has lost what it held. What was lost earlier keeps the revision of its earlier loss.
     fn lose(&mut self, held_until: Revision) {
         for decided in &mut self.commits {
             decided.began.held_until.get_or_insert(held_until);
         }
     }
 
-    /// What an instance had decided was not made, and so is nothing behind it: the recorder makes neither. A commit that failed may be made all the
-    /// same, with those behind it up to the next operation that failed: in order they come to what the program says. An operation may not: why it
-    /// was refused is not known to be over.
+    /// A decision of an instance was not performed, nor was anything behind it, because the recorder stops there. A failed commit may still be made,
+    /// with those behind it up to the next failed operation: made in order, they give the world that the program says. A failed operation may not:
+    /// the reason of its refusal may still exist.
     fn failed(&mut self, instance: InstanceId, unmade: Unmade) {
         let is_meant = |one: &&Operated| match unmade {
             Unmade::Untried => false,
             Unmade::Operation(failed) => one.number == failed,
-            // A log of an earlier version: the first one that may be meant.
+            // A log of an earlier version: takes the first operation that may be meant.
             Unmade::Unknown => one.instance == instance,
         };
         let Some(failed) = self.operated.iter().find(is_meant).map(|one| one.number) else { return };
@@ -323,7 +323,7 @@ impl Ledger {
         self.commits.retain(|decided| decided.behind < failed);
     }
 
-    /// Operations are done up to this one, which has come to these units.
+    /// The operations up to number `last` are done; `units` is the result of the last one.
     fn done(&mut self, last: u64, units: &[Vec<OperatedUnits>]) {
         for one in self.operated.extract_if(.., |one| one.number <= last) {
             let units: &[Vec<OperatedUnits>] = if one.number == last { units } else { &[] };
@@ -336,12 +336,12 @@ impl Ledger {
         }
     }
 
-    /// The operations that may not be done in the run's session, in order.
+    /// The operations that are perhaps not done in the run's session, in order.
     pub(super) fn open_operations(&self) -> impl Iterator<Item = &Operated> {
         self.operated.iter()
     }
 
-    /// A goal is told to stop.
+    /// A goal is cancelled.
     fn stops(&mut self, instance: InstanceId, attempt: u32) {
         let is_meant = self.goals.get(&instance).is_some_and(|goal| goal.0 == attempt);
         if let Some((_, goal)) = is_meant.then(|| self.goals.remove(&instance)).flatten() {
@@ -350,8 +350,8 @@ impl Ledger {
         }
     }
 
-    /// Leaves out what was confirmed long ago, so that the ledger does not grow with the run.
-    /// A world pool that has none of the commits left needs older ones: they are in the log.
+    /// Forgets what was confirmed long ago, so that the ledger does not grow with the run. A world pool that has none of the kept commits needs older
+    /// ones, which are in the log.
     pub(super) fn forget(&mut self, confirmed: Confirmed) {
         self.forget_but(KEPT, confirmed);
     }
@@ -416,7 +416,7 @@ mod tests {
         assert_eq!(ledger.goals.len(), 1);
         ledger.event(Timestamp(1), &Event::Crashed { instance, attempt: 2, reason: String::new(), unknown: false });
         assert!(ledger.goals.is_empty());
-        // It may go on all the same, if its projection could not be made: whoever comes back tells it to stop.
+        // The goal may go on if its projection could not be made: a resumption cancels it.
         assert_eq!(ledger.stopped.iter().map(|(_, attempt, _)| *attempt).collect::<Vec<_>>(), [2]);
     }
 
@@ -455,7 +455,7 @@ mod tests {
         ledger.event(Timestamp(1), &recorded(1, 7, vec![vec![units("Box-1", "Box", 3)]]));
         ledger.event(Timestamp(1), &recorded(2, 7, vec![vec![units("Box-1", "Box", 1)]]));
         assert_eq!((open(&ledger), left(&ledger)), (vec![3], vec![("Box-1".to_owned(), 2)]));
-        // A resumption has made all of it so in a session of its own, and does the rest there.
+        // A resumption has recreated all of it in a new session, and does the rest there.
         let renamed = BTreeMap::from([("Box-1".to_owned(), "Box-9".to_owned())]);
         ledger.event(Timestamp(2), &Event::Recorded { operation: 2, session: 9, units: Vec::new(), renamed });
         assert_eq!((open(&ledger), left(&ledger)), (vec![3], vec![("Box-9".to_owned(), 2)]));
@@ -597,7 +597,7 @@ mod tests {
             let commits = ledger.commits.iter().map(|decided| decided.revision.0).collect::<Vec<_>>();
             (commits, ledger.operated.iter().map(|one| one.number).collect::<Vec<_>>())
         };
-        // A commit that failed may be made: what was done before is not taken for what failed.
+        // A failed commit may still be made: an operation that was done before is not taken for the failed one.
         ledger.event(Timestamp(1), &recorded(1, 7, Vec::new()));
         let failed = |instance: u64| Event::RetirementFailed {
             instance: InstanceId(instance),
@@ -608,7 +608,7 @@ mod tests {
         assert_eq!(left(&ledger), (vec![1, 2, 3], vec![2, 3]));
         ledger.event(Timestamp(2), &failed(2));
         assert_eq!(left(&ledger), (vec![1, 2], vec![]));
-        // Those behind it fail as well, and what is decided on the way out is not made either.
+        // Those behind it fail as well, and what is decided on the way out is not performed either.
         ledger.event(Timestamp(2), &failed(3));
         ledger.command(&commits(InstanceId(4), 4));
         ledger.command(&operates(4));
@@ -627,7 +627,7 @@ mod tests {
             ledger.command(&commits(InstanceId(number), number));
             ledger.command(&operates(number));
         }
-        // The commit of the first, and so all behind it: nothing of that was tried.
+        // The commit of the first instance fails, and so does everything behind it: none of that was tried.
         for instance in [1, 1, 2, 2] {
             let (instance, reason) = (InstanceId(instance), String::new());
             ledger.event(Timestamp(1), &Event::RetirementFailed { instance, reason, unmade: Unmade::Untried });
@@ -674,7 +674,7 @@ mod tests {
             short.forget_but(4, confirmed);
             assert_eq!((&short.account, &short.operated), (&whole.account, &whole.operated));
             assert_eq!(short.operated.len() as u64, number.min(3), "it does not grow with the run");
-            // Whatever is not confirmed is there, and a few besides.
+            // Everything that is not confirmed is kept, and a few more.
             let commits = (number / 2).saturating_sub(4);
             assert_eq!((short.forgotten, &short.commits[..]), (commits, &whole.commits[commits as usize..]));
         }

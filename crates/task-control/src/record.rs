@@ -1,6 +1,5 @@
-//! What must reach the world pool and the resource manager in the order in which it was decided: projections, commits,
-//! creation and deletion of task resources. One task; what changes something is one request at a time, and projections of what a commit makes are
-//! asked for while that is on its way.
+//! Performs in the order of decision what must reach the world pool and the resource manager: projections, commits, creation and deletion of task
+//! resources. It is one task and makes one change at a time; projections that include a commit are requested while that commit is under way.
 
 use super::decided::{Unanswered, Undone, insist};
 use super::ledger::{Began, Confirmed, Projecting, created, operation_request};
@@ -32,10 +31,10 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 /// How far the world pool may be behind before the run is given up.
 pub(super) const MAX_PENDING_RECORDS: usize = 65_536;
 
-/// Others who write without a pause do not hold up a commit more often than this.
+/// How often a commit is repeated at most because others write without a pause.
 const MAX_OVERTAKEN: u32 = 100;
 
-/// As the world pool names its refusals.
+/// Reason codes of the world pool.
 const NO_SUCH_COMMIT: &str = "NO_SUCH_COMMIT";
 const ENDED: &str = "PROJECTION_ENDED";
 const REUSED: &str = "REQUEST_ID_REUSED";
@@ -46,14 +45,14 @@ pub(super) enum Record {
     Project {
         instance: InstanceId,
         asked: Projecting,
-        /// Where its goal has it already.
+        /// The id under which its goal has the projection already.
         named: Option<Named>,
     },
     Commit {
         decided: Decided,
-        /// Under which condition it is made, where the run has lost, or given back, what it was made with.
+        /// The condition under which it is made, if the run has lost, or given back, the leases with which it was made.
         untouched: Option<Untouched>,
-        /// What has to be safe before.
+        /// What has to be safe on disk first.
         safe: Option<Mark>,
     },
     Operate {
@@ -63,53 +62,53 @@ pub(super) enum Record {
         operations: Vec<Requirement>,
         order: Order,
     },
-    /// Something had failed before task control was gone: nothing is made behind that.
+    /// A failure before task control was restarted: nothing is performed behind it.
     Failed(String),
-    /// Answers once everything before it is done: with the first failure of the run, if there was one.
+    /// Answers once everything before it is done, with the first failure of the run, if there was one.
     Flush(oneshot::Sender<Result<(), String>>),
 }
 
-/// The place of an operation among the leases of the run.
+/// The order of an operation relative to the leases of the run.
 #[derive(Debug)]
 pub(super) struct Order {
-    /// What has to be safe before.
+    /// What has to be safe on disk first.
     pub(super) safe: Option<Mark>,
-    /// Leases that were given back before and may be what is used up or deleted: each token is cancelled when its lease is back.
+    /// Leases that were given back before and may contain what is used up or deleted: each token is cancelled when its lease is back.
     pub(super) after: Vec<CancellationToken>,
-    /// Is dropped when it has its answer: what is asked for behind it leaves then.
+    /// Dropped when the operation has its answer: requests that wait for it are sent then.
     pub(super) _ends: DropGuard,
 }
 
-/// A projection that was named before it is there.
+/// A projection that has an id before it exists.
 #[derive(Debug)]
 pub(super) struct Named {
     pub(super) id: ProjectionId,
-    /// Told when it is there.
+    /// Told when the projection exists.
     pub(super) made: oneshot::Sender<Made>,
-    /// Whether it may have been asked for before task control was gone.
+    /// Whether it may have been requested before task control was restarted.
     pub(super) again: bool,
 }
 
-/// What an instance has changed, to become real.
+/// The changes by an instance, to become real.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Decided {
     pub(super) instance: InstanceId,
-    /// By path.
+    /// The path of the instance or composite state.
     pub(super) writer: String,
     pub(super) changes: Vec<Change>,
     pub(super) evidence: Evidence,
-    /// What the run's root becomes: the pool's, as long as nobody else writes into it.
+    /// The revision of the run's root after it: the same as the pool's, as long as nobody else writes into that.
     pub(super) revision: Revision,
-    /// How what led to that began.
+    /// How the instance or composite state began.
     pub(super) began: Began,
-    /// The pool's revision that the run had heard of when it was decided.
+    /// The pool's revision that the run had heard of when the commit was decided.
     pub(super) knew: Revision,
-    /// How many operations were decided before it: it is made behind them.
+    /// Number of operations that were decided before it: the commit is made behind them.
     pub(super) behind: u64,
 }
 
 impl Decided {
-    /// As the world pool is asked for it by the run.
+    /// The commit as the world pool gets it.
     pub(super) fn commit(self, run: &str) -> Commit {
         let id = self.id(run);
         let Decided { writer, changes, evidence, .. } = self;
@@ -122,13 +121,13 @@ impl Decided {
     }
 }
 
-/// Attempts whose projection nobody waits for any more.
+/// Attempts whose projection is not needed any more.
 pub(super) type Cancelled = Arc<Mutex<BTreeSet<(InstanceId, u32)>>>;
 
-/// How far the recorder is. Goals that look at the root wait for that.
+/// How far the recorder is. Goals that read the root wait for it.
 pub(super) type Recorded = Arc<watch::Sender<Confirmed>>;
 
-/// The task that does it.
+/// The task that performs the records.
 pub(super) struct Recorder {
     pub(super) run: String,
     pub(super) world: WorldClient,
@@ -136,20 +135,20 @@ pub(super) struct Recorder {
     pub(super) cancelled: Cancelled,
     pub(super) done: Recorded,
     pub(super) events: mpsc::Sender<Answer>,
-    /// The run's session: what it no longer holds others may have changed since.
+    /// Whether the run's session lives: what the run no longer holds may have been changed by others.
     pub(super) trust: Trust,
-    /// Its number.
+    /// The number of the session.
     pub(super) session: u64,
     /// The run's place in its trace.
     pub(super) trace: TraceContext,
     pub(super) root: Root,
-    /// What the pool promises goes there.
+    /// Receives the ids that the pool promises.
     pub(super) promises: Promises,
-    /// Whom it waits for.
+    /// What the recorder waits for.
     pub(super) waiting: Waiting,
 }
 
-/// The pool's root as far as it is known: what the run's own revisions come to there, and what it was told of others'. Clones share it.
+/// The pool's root as far as it is known: from the run's own commits, and from what it was told of others'. Clones share it.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Root(Arc<AtomicU64>);
 
@@ -158,22 +157,22 @@ impl Root {
         Revision(self.0.load(Ordering::SeqCst))
     }
 
-    /// The pool's root is at this revision, or has been.
+    /// The pool's root has, or had, this revision.
     pub(super) fn reached(&self, revision: Revision) {
         self.0.fetch_max(revision.0, Ordering::SeqCst);
     }
 }
 
-/// A commit that is on its way.
+/// A commit under way.
 #[derive(Debug, Clone)]
 struct UnderWay {
     id: String,
-    /// When it has its answer.
+    /// Cancelled when the commit has its answer.
     over: CancellationToken,
 }
 
 impl Recorder {
-    /// Until nobody can ask any more.
+    /// Works until no more records can come.
     pub(super) async fn work(self, mut records: mpsc::Receiver<Record>) {
         let (mut recorded, mut next) = (Ok(()), None);
         loop {
@@ -190,7 +189,7 @@ impl Recorder {
                     self.project(instance, asked, named, None);
                     None
                 }
-                // Nothing is made behind what was not: the world is that of a prefix of what was decided.
+                // Nothing is performed behind a failure: the world is that of a prefix of what was decided.
                 Record::Commit { decided: Decided { instance, .. }, .. } | Record::Operate { instance, .. }
                     if let Err(reason) = &recorded =>
                 {
@@ -220,7 +219,7 @@ impl Recorder {
                         }
                     };
                     let mut committing = pin!(trace::within(self.of(instance), committing));
-                    // It leaves here, and these right behind it: the world pool is woken once.
+                    // The commit is sent here, and the projections right behind it: the world pool is woken once.
                     let answered = committing.as_mut().now_or_never();
                     for (instance, asked, named) in with_it {
                         self.project(instance, asked, named, Some(under_way.clone()));
@@ -245,7 +244,7 @@ impl Recorder {
                     let operating = self.operate(instance, number, operations, &order);
                     let operated = trace::within(self.of(instance), operating).await;
                     behind = Some(order);
-                    // Whoever resumes the run does not do it again.
+                    // The event is logged, so that a resumption does not repeat the operation.
                     Some(operated.unwrap_or_else(|failed| failed))
                 }
                 Record::Failed(reason) => {
@@ -261,16 +260,16 @@ impl Recorder {
                 recorded = Err(reason.clone());
                 self.done.send_modify(|done| done.failed = Some((*instance, *unmade)));
             }
-            // Nothing behind a failure counts: what is confirmed is confirmed without a gap.
+            // Nothing behind a failure counts: confirmations have no gap.
             if recorded.is_ok() {
                 self.confirm(confirms);
             }
             self.waiting.set(WaitsFor::Nobody);
-            // Where nobody hears of events any more, the run has ended and is told of the first failure by a flush.
+            // If nobody receives events any more, the run has ended, and a flush tells it the first failure.
             if let Some(event) = event {
                 let _ = self.events.send(event.into()).await;
             }
-            // Nobody is granted anything behind an operation before it is heard that this has failed.
+            // No acquire behind an operation is sent before the executive hears that the operation has failed.
             drop(behind);
         }
     }
@@ -289,7 +288,7 @@ impl Recorder {
         });
     }
 
-    /// Begins to have a projection made.
+    /// Starts to make a projection.
     fn project(&self, instance: InstanceId, asked: Projecting, named: Option<Named>, after: Option<UnderWay>) {
         let Projecting { attempt, base, changes, writers, reads, lease, .. } = asked;
         let request = format!("{}/{instance}/{attempt}", self.run);
@@ -310,13 +309,13 @@ impl Recorder {
                 let _ = events.send(event.into()).await;
             }
         }));
-        // It is asked for here, so that it goes with the commit before it.
+        // The request is sent here, so that it goes with the commit before it.
         if making.as_mut().now_or_never().is_none() {
             tokio::spawn(making);
         }
     }
 
-    /// The failure, where what has to be safe before never will be.
+    /// The failure event, if what has to be safe on disk never will be.
     async fn unsafe_on_disk(&self, instance: InstanceId, safe: Option<Mark>) -> Option<Event> {
         self.waiting.set(WaitsFor::Disk);
         let is_safe = match safe {
@@ -362,7 +361,7 @@ impl Recorder {
                 Ok(done) => units.push(done),
                 Err(undone) => {
                     let reason = format!("`{operation}` was not done: {undone}");
-                    // With the session lost it was not refused, and may be done by whoever resumes the run.
+                    // If the session was lost, the operation was not refused, and may be done by whoever resumes the run.
                     let lost = matches!(undone, Undone::Lost);
                     let unmade = if lost { Unmade::Untried } else { Unmade::Operation(number) };
                     return Err(Event::RetirementFailed { instance, reason, unmade });
@@ -387,7 +386,7 @@ struct MakingProjection {
 }
 
 impl MakingProjection {
-    /// The event that it leads to, if any.
+    /// Makes the projection; returns the resulting event, if there is one.
     async fn make(mut self) -> Option<Event> {
         let (instance, attempt) = (self.instance, self.attempt);
         if self.is_cancelled() {
@@ -397,7 +396,7 @@ impl MakingProjection {
         let made = self.ask().await;
         match (made, self.named.take()) {
             (Ok(_), Some(named)) => {
-                // Nobody waits for that where its goal is under way.
+                // Nobody receives this message if the goal is under way already.
                 let _ = named.made.send(Made);
                 None
             }
@@ -406,7 +405,7 @@ impl MakingProjection {
                 None
             }
             (Ok(projection), None) => Some(Event::Projected { instance, attempt, projection }),
-            // It was there, whatever has become of it: its goal knows.
+            // The projection existed, whatever has become of it: its goal knows.
             (Err(error), Some(Named { again: true, .. })) if matches!(error.reason(), ENDED | REUSED) => None,
             (Err(error), named) => {
                 // If the world pool was started again, it has promised nothing.
@@ -423,17 +422,17 @@ impl MakingProjection {
         }
     }
 
-    /// It will not be made: a worker that waits for it need not wait longer.
+    /// The projection will not be made: a worker that waits for it is told so.
     async fn take_back(&mut self) {
         if let Some(named) = self.named.take() {
             let _ = retry_unanswered(|| self.world.release(named.id)).await;
         }
     }
 
-    /// Asks the world pool, again where the commit below it takes long.
+    /// Asks the world pool, repeatedly if the commit below the projection takes long.
     async fn ask(&mut self) -> Result<ProjectionId, CallError> {
         loop {
-            // What the run knows is real there by now, whatever number it has.
+            // What the run knows is real in the pool by now, whatever its revision there.
             let base = self.wanted.base.max(self.root.get());
             let wanted = Projection { base, ..self.wanted.clone() };
             let after = self.after.as_ref().map(|commit| commit.id.clone());
@@ -467,10 +466,10 @@ fn confirms(record: &Record) -> Confirmed {
     }
 }
 
-/// Commits on top of whatever others have committed, while the run has what it had; the pool's root with it. `known` is a revision that the
-/// pool has had: one that has lost it takes nothing. What others committed before the run is asked whether it has what it had, they committed while
-/// the run held what its commit is about; so that is asked behind the reading of the root and before the commit. What was made with what the run has
-/// lost since is committed only where it is `untouched` up to the root on which it is made.
+/// Commits on top of whatever others have committed, while the run's session lives; returns the pool's root, too. `known` is a revision that the pool
+/// has had: a pool that has lost it takes nothing. The run is asked whether its session lives after the root was read and before the commit, so what
+/// others had committed before, they committed while the run held what its commit is about. What was made with leases that the run has lost since is
+/// committed only if it is `untouched` up to the root on which it is made.
 pub(super) async fn commit_next(
     world: &WorldClient,
     trust: &Trust,
@@ -499,14 +498,14 @@ pub(super) async fn commit_next(
     }
 }
 
-/// An operation is done, in the session of this number, and has come to these units, if all of that is known.
+/// The event of an operation that is done, in the session of this number; with its units if all of them are known.
 pub(super) fn recorded(operation: u64, session: u64, units: Vec<Option<Vec<OperatedUnits>>>) -> Event {
     let units = units.into_iter().collect::<Option<Vec<_>>>().unwrap_or_default();
     Event::Recorded { operation, session, units, renamed: BTreeMap::new() }
 }
 
-/// Creates, deletes or consumes, once however often it is asked for under this request id; a resource manager that is away is waited for as long as
-/// the run's session may live. What it has come to, if the manager says that.
+/// Creates, deletes or consumes, once however often it is requested under this id; waits for an absent resource manager as long as the run's session
+/// may live. Returns the units, if the manager reports them.
 pub(super) async fn operate_once(
     resources: &ResourceClient,
     trust: &Trust,
@@ -523,7 +522,7 @@ pub(super) async fn operate_once(
         }
         ResourceOperation::Delete => resources.delete_units_once(request, operation.clone()).await,
         ResourceOperation::Consume => resources.consume_units_once(request, operation.clone(), "").await,
-        // The executive gives these to an acquire.
+        // The executive puts these into an acquire.
         ResourceOperation::Block | ResourceOperation::Exists => Ok(Some(Vec::new())),
     };
     insist(trust, Unanswered::Waits, ask).await

@@ -1,21 +1,21 @@
-//! Whom what is decided waits for: to say so where that is in vain.
+//! What the decisions that are to be performed wait for, so that it can be said if the wait is in vain.
 
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Whom the next of what was decided waits for.
+/// What the next decision to be performed waits for.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) enum WaitsFor {
     /// Nothing waits.
     #[default]
     Nobody,
-    /// The log, which has to be safe before.
+    /// The log, which has to be safe on disk first.
     Disk,
     /// Leases, which have to be back before something is used up or deleted.
     Leases,
-    /// For what is created, deleted or used up.
+    /// The answer to a create, delete or consume.
     ResourceManager,
-    /// For a commit.
+    /// The answer to a commit.
     WorldPool,
 }
 
@@ -31,7 +31,7 @@ impl fmt::Display for WaitsFor {
     }
 }
 
-/// The one place where that is kept. Clones share it.
+/// The one place where this is kept. Clones share it.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Waiting(Arc<Mutex<WaitsFor>>);
 

@@ -100,8 +100,8 @@ impl Window {
         }
     }
 
-    /// Cancels what says of itself what being cut short changes, in the order of threads of control, as the sequential program does. Of one thread
-    /// the oldest comes last, because only that one is at its place in the sequential program.
+    /// Cancels running routines, and running nodes that declare effects for `preempted`, in the order of threads of control, as the sequential
+    /// program does. Within a thread the oldest comes last, because only that one is at its place in the sequential program.
     fn say_what_is_cut_short(&mut self, context: &mut Context<'_>) {
         let declares = |instance: &Instance| {
             let declared = context.program.state(instance.state).annotations.effects.get(PREEMPTED);
@@ -143,8 +143,8 @@ impl Window {
         }
     }
 
-    /// The instances at which the sequential program would be, one per thread of control: the oldest ones that are not real. Of a line that is
-    /// expanded past a running imprecise PIA this is that PIA, and the regions of a younger fork have not begun there.
+    /// The instances at which the sequential program would be, one per thread of control: the oldest ones that are not real. If a line is expanded
+    /// past a running imprecise PIA, this is that PIA, and the regions of a younger fork have not begun there.
     fn places(&self) -> Vec<&Instance> {
         let detached = self.graph.detached().iter().filter_map(|id| self.graph.get(*id));
         // The sequential program has not begun a motion whose path was left.

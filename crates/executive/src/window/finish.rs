@@ -124,8 +124,8 @@ impl Window {
         self.end_node(context, id, ended);
     }
 
-    /// The end of a node whose goal has answered so: with the values that it assigns, or `aborted` if the answer is no valid one or a value cannot be
-    /// evaluated.
+    /// The end of a node whose goal gave this answer: with the values that the node assigns, or `aborted` if the answer is invalid or a value cannot
+    /// be evaluated.
     pub(super) fn end_of_answer(&self, context: &Context<'_>, id: InstanceId, mut ended: Ended) -> Ended {
         let Some(instance) = self.graph.get(id) else { return ended };
         let state = context.program.state(instance.state);

@@ -63,12 +63,12 @@ fn operation(number: i32) -> Result<ResourceOperation, Malformed> {
     }
 }
 
-/// An amount as it may come from anywhere.
+/// An amount from the wire, which may be any number.
 fn amount(number: f64, field: &str) -> Result<Quantity, Malformed> {
     Quantity::try_from(number).map_err(|error| Malformed::new(field, error.to_string()))
 }
 
-/// An amount that is something.
+/// An amount greater than zero.
 fn some(number: f64, field: &str) -> Result<Quantity, Malformed> {
     match amount(number, field)? {
         Quantity::ZERO => Err(Malformed::new(field, "is 0: it must be more than nothing")),

@@ -1,4 +1,4 @@
-//! What goes onto the wire comes back the same, through the bytes; what means nothing is refused with its path.
+//! Values come back equal from the wire format, through bytes; meaningless messages are refused with the path of the field.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use super::*;
@@ -18,7 +18,7 @@ use ratn_model::value::{Trajectory, TrajectoryPoint};
 use std::fmt::Debug;
 use std::sync::Arc;
 
-/// Over the wire and back.
+/// Converts a value to the wire format and back.
 fn check<T, W>(original: &T) -> Result<(), TestCaseError>
 where
     T: Clone + PartialEq + Debug + TryFrom<W, Error = Malformed>,

@@ -1,6 +1,7 @@
-//! What a run has made and used up in its session, by the ids that the resource manager told: what has to be made so again where the session is lost.
+//! The account of a run: what it has created and used up in its session, by the ids that the resource manager reported. If the session is lost, all
+//! of it has to be made again.
 //!
-//! What others had made and the run has deleted, and what is used up for good, is not in it: that outlasts the session.
+//! The account omits deletions of others' resources and permanent consumption, because both outlast the session.
 
 use ratn_model::resource::{Lease, OperatedUnits, Quantity, Requirement, ResourceOperation};
 use serde::{Deserialize, Serialize};
@@ -9,24 +10,24 @@ use std::collections::BTreeMap;
 /// See the module.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Account {
-    /// In the order in which it was created.
+    /// In the order of creation.
     created: Vec<Created>,
-    /// By the resource. It returns with the session, or goes with the resource.
+    /// By resource. These units return when the session ends, or vanish with their resource.
     used_up: BTreeMap<String, UsedUp>,
-    /// The first operation of which it is not known what it came to.
+    /// The first operation whose result is unknown.
     unknown: Option<String>,
 }
 
-/// What is left of something that the run has created.
+/// What is left of a resource that the run has created.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Created {
     /// Its id.
     pub(crate) resource: String,
-    /// As it was created, with the count that is left.
+    /// The requirement with which it was created, with the count that is left.
     pub(crate) left: Requirement,
 }
 
-/// What of a resource the run has used up.
+/// The units of a resource that the run has used up.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct UsedUp {
     pub(crate) kind: String,
@@ -34,7 +35,7 @@ pub(crate) struct UsedUp {
 }
 
 impl Account {
-    /// Operations are done, with what each has come to.
+    /// The operations are done; `units` has the result of each.
     pub(crate) fn operated(&mut self, operations: &[Requirement], units: &[Vec<OperatedUnits>]) {
         if units.len() != operations.len() {
             let unknown = operations.first().map(ToString::to_string);
@@ -46,7 +47,7 @@ impl Account {
         }
     }
 
-    /// One operation is done, or the part of a grant.
+    /// An operation, or the consumption of a grant, is done.
     fn done(&mut self, operation: &Requirement, units: &[OperatedUnits]) {
         for one in units {
             match operation.operation {
@@ -61,7 +62,7 @@ impl Account {
         }
     }
 
-    /// A lease was granted; what it has used up is in it, unless the resource manager does not say that.
+    /// A lease was granted. It lists the units that the grant has used up, unless the resource manager does not report them.
     pub(crate) fn granted(&mut self, requirements: &[Requirement], lease: &Lease) {
         let consumes = |one: &&Requirement| one.operation == ResourceOperation::Consume;
         let wanted: Quantity = requirements.iter().filter(consumes).map(|one| one.count).sum();
@@ -90,7 +91,7 @@ impl Account {
         used_up.units = Quantity::from_thousandths(sum.min(Quantity::MAX.thousandths()));
     }
 
-    /// What was created is there under other ids.
+    /// The created resources exist again, under other ids.
     pub(crate) fn renamed(&mut self, renamed: &BTreeMap<String, String>) {
         let name = |old: &mut String| {
             if let Some(new) = renamed.get(old) {
@@ -103,17 +104,17 @@ impl Account {
             used_up.map(|(resource, used_up)| (renamed.get(&resource).cloned().unwrap_or(resource), used_up)).collect();
     }
 
-    /// The first operation of which it is not known what it came to.
+    /// The first operation whose result is unknown.
     pub(crate) fn unknown(&self) -> Option<&str> {
         self.unknown.as_deref()
     }
 
-    /// What the run has created and not deleted again.
+    /// The resources that the run has created and not deleted again.
     pub(crate) fn created(&self) -> &[Created] {
         &self.created
     }
 
-    /// What the run has used up that is there again when its session has ended, or goes with it; by the resource.
+    /// By resource: the units used up by the run that return when its session ends, or vanish with it.
     pub(crate) fn used_up(&self) -> impl Iterator<Item = (&str, &UsedUp)> {
         self.used_up.iter().map(|(resource, used_up)| (resource.as_str(), used_up))
     }

@@ -1,5 +1,5 @@
-//! With what a run has begun what it commits: how much of what others had made it knew then, and whether it has lost since what it held. A pure
-//! fold, of the log in the ledger, and of the commands of a run that came back.
+//! The beginnings of what a run commits: up to which revision it knew the changes by others then, and whether it has lost its leases since. A pure
+//! fold, over the log (in the ledger), and over the commands of a resumed run.
 //!
 //! ```text
 //! an action           counts from when it was granted what it holds, or its last goal was given
@@ -9,8 +9,8 @@
 //! anything else       from now: it holds nothing
 //! ```
 //!
-//! Only composite states are followed that change the world when they are left. They have no instances that the log tells of, but for routines: they
-//! are known by their paths, as their commits name them. A routine inside of a routine is part of that, and counts as any other composite state.
+//! Only composite states that change the world at their exit are followed. The log names no instances of them, except for routines: they are
+//! identified by their paths, as in their commits. A routine inside of a routine is part of it, and counts as any other composite state.
 
 use ratn_event_log::without_visits;
 use ratn_executive::protocol::{Command, Event, Note};
@@ -18,51 +18,51 @@ use ratn_model::id::{InstanceId, Revision};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// So many composite states are followed; of more one is forgotten of which nothing is under way, the one that began first. One that is left by an
-/// outcome for which it declares no effects stays until then, and so does one that was only expected.
+/// Maximum number of composite states that are followed. Beyond it, of those with nothing under way, the one that began first is forgotten. A state
+/// that is left by an outcome without declared effects stays until then, and so does one that was only expected.
 const MOST_ENTERED: usize = 1024;
 
-/// A beginning.
+/// The beginning of an action, a routine or another composite state.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Began {
-    /// The revision of the root that the run had heard of then.
+    /// The root revision that the run had heard of then.
     pub(crate) knows: Revision,
-    /// Up to this revision it held what it works with, where the run has lost that since; where it has not, nobody else changes what it changes.
+    /// The revision up to which it held its leases, if the run has lost them since; if it has not, nobody else changes what it changes.
     pub(crate) held_until: Option<Revision>,
 }
 
 impl Began {
-    /// Behind which revision others' changes count, where they do: what the run had heard of, it knew, and what they changed while it held what it
-    /// worked with, they did not change with that.
+    /// The revision after which others' changes count, if they do. The run knew the changes that it had heard of; and changes made while it held its
+    /// leases were not made with its resources.
     pub(crate) fn others_count(&self) -> Option<Revision> {
         self.held_until.map(|held| held.max(self.knows))
     }
 
-    /// Whether it is behind a loss that another one was before.
+    /// Whether it began after a loss that affects the other one.
     fn is_since(&self, other: &Began) -> bool {
         other.held_until.is_some_and(|lost| self.held_until.is_none_or(|own| own > lost))
     }
 }
 
-/// A composite state that has begun, and has not been left.
+/// A composite state that has begun and has not been left.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Entered {
     began: Began,
-    /// The instance of a routine.
+    /// Its instance, if it is a routine.
     routine: Option<InstanceId>,
-    /// Its parts that have begun and not come to their ends, and how.
+    /// Its parts that have begun and not ended, with their beginnings.
     parts: BTreeMap<InstanceId, Began>,
     /// Whether the result of a part is real. Until one is, the state may only be expected.
     is_real: bool,
 }
 
 impl Entered {
-    /// Whether all that has begun of it was discarded. It was only expected, unless its commit follows: its first part was cut short then.
+    /// Whether everything that had begun in it was discarded. Then it was only expected, unless its commit follows: its first part was cut short then.
     fn is_discarded(&self) -> bool {
         self.parts.is_empty() && !self.is_real && self.routine.is_none()
     }
 
-    /// A part of it is real.
+    /// The result of a part is real.
     fn part_is_real(&mut self, part: Began) {
         let is_earlier = || part.held_until == self.began.held_until && part.knows < self.began.knows;
         if self.routine.is_none() && (part.is_since(&self.began) || is_earlier()) {
@@ -71,22 +71,22 @@ impl Entered {
         self.is_real = true;
     }
 
-    /// Whether something of it is under way.
+    /// Whether the routine itself, or a part, is under way.
     fn is_open(&self) -> bool {
         !self.parts.is_empty() || self.routine.is_some()
     }
 }
 
-/// Where an instance is among the composite states that are followed.
+/// The followed composite states around an instance.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Inside {
-    /// The innermost first, by path.
+    /// Their paths, innermost first.
     states: Vec<String>,
-    /// Whether the first of them is its own: it is a routine's.
+    /// Whether the first of them is the instance's own state: a routine.
     is_routine: bool,
 }
 
-/// What has begun and has not come to its end.
+/// Everything that has begun and has not ended.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Beginnings {
     /// Paths (without visits) of the composite states that change the world when they are left.
@@ -94,12 +94,12 @@ pub(crate) struct Beginnings {
     instances: BTreeMap<InstanceId, Began>,
     /// By path.
     entered: BTreeMap<String, Entered>,
-    /// The instances in such states.
+    /// The instances in followed states.
     inside: BTreeMap<InstanceId, Inside>,
 }
 
 impl Beginnings {
-    /// An event of a run that knows of this revision.
+    /// Follows an event of a run that has heard of this revision.
     pub(crate) fn event(&mut self, event: &Event, knows: Revision) {
         match event {
             Event::Started { origin, .. } => self.composites.clone_from(&origin.natures.changes_at_exit),
@@ -109,7 +109,7 @@ impl Beginnings {
         }
     }
 
-    /// A command of a run that knows of this revision. [`Beginnings::of`] says what a commit is made of before that is followed.
+    /// Follows a command of a run that has heard of this revision. The beginning of a commit, [`Beginnings::of`], has to be read before.
     pub(crate) fn command(&mut self, command: &Command, knows: Revision) {
         match command {
             Command::Start { instance, .. } => self.begins(*instance, knows),
@@ -127,13 +127,13 @@ impl Beginnings {
         }
     }
 
-    /// The beginning of what a commit is made of; `None` where nothing of that is known to have begun.
+    /// The beginning of what a commit is based on; `None` if no beginning is known.
     pub(crate) fn of(&self, instance: InstanceId, writer: &str) -> Option<Began> {
         let composite = self.entered.get(writer).map(|entered| entered.began);
         composite.or_else(|| self.instances.get(&instance).copied())
     }
 
-    /// Behind which revision others' changes count at the earliest, where anything is under way that has lost what it held.
+    /// The earliest revision after which others' changes count for anything under way that has lost its leases.
     pub(crate) fn others_count(&self) -> Option<Revision> {
         let composites = self.entered.values().map(|entered| &entered.began);
         self.instances.values().chain(composites).filter_map(Began::others_count).min()
@@ -145,14 +145,14 @@ impl Beginnings {
         self.instances.is_empty() && self.entered.is_empty() && self.inside.is_empty()
     }
 
-    /// It works from now on with what the run holds.
+    /// The instance works from now on with what the run holds.
     fn begins(&mut self, instance: InstanceId, knows: Revision) {
         let began = Began { knows, held_until: None };
         self.instances.insert(instance, began);
         self.enters(instance, 0, began);
     }
 
-    /// An instance begins a routine: that is made of what it knows now, whatever its parts begin with.
+    /// An instance begins a routine: the routine is based on what the run knows now, whatever its parts begin with.
     fn routine_begins(&mut self, instance: InstanceId, knows: Revision) {
         let Some(inside) = self.inside.get(&instance).filter(|inside| inside.is_routine) else { return };
         let began = Began { knows, held_until: None };
@@ -161,7 +161,7 @@ impl Beginnings {
         self.enters(instance, 1, began);
     }
 
-    /// What an instance begins, the states around it have begun, from so many of the innermost on.
+    /// An instance begins, and so do the states around it, without the `from` innermost ones.
     fn enters(&mut self, instance: InstanceId, from: usize, began: Began) {
         let Some(inside) = self.inside.get(&instance) else { return };
         for path in inside.states.iter().skip(from) {
@@ -194,7 +194,7 @@ impl Beginnings {
         }
     }
 
-    /// What the run held is gone. Of what was lost before, others' changes count since then.
+    /// The run has lost what it held. What was lost earlier keeps the revision of its earlier loss.
     fn lose(&mut self, held_until: Revision) {
         let composites =
             self.entered.values_mut().flat_map(|entered| entered.parts.values_mut().chain([&mut entered.began]));
@@ -203,7 +203,7 @@ impl Beginnings {
         }
     }
 
-    /// Which composite states are around an instance of this path.
+    /// The composite states around an instance with this path.
     fn inside_of(&self, path: &str) -> Inside {
         if self.composites.is_empty() {
             return Inside { states: Vec::new(), is_routine: false };
@@ -221,7 +221,7 @@ impl Beginnings {
     }
 }
 
-/// The path of a state, by that of what its list is in: of a loop that has the number of the iteration.
+/// The path of a state, from the path in its list: for a loop, this removes the number of the iteration.
 fn without_iteration(path: &str) -> &str {
     let number = path.strip_suffix(']').and_then(|path| path.rsplit_once('['));
     number.map_or(path, |(state, _)| state)
@@ -240,7 +240,7 @@ mod tests {
     use ratn_model::id::{FencingToken, LeaseId, StateId};
     use ratn_model::resource::Lease;
 
-    /// A run that follows these states, and knows more with each step.
+    /// A run that follows these states; what it knows grows with each step.
     struct Bench {
         beginnings: Beginnings,
         knows: u64,
@@ -295,7 +295,7 @@ mod tests {
             self.beginnings.event(&Event::SessionLost { held_until: Revision(0) }, Revision(self.knows));
         }
 
-        /// What a commit of a composite state knows, and whether that is lost.
+        /// What the commit of a composite state knows, and whether the run has lost its leases since.
         fn of(&self, writer: &str) -> Option<(u64, bool)> {
             let began = self.beginnings.of(InstanceId(0), writer)?;
             Some((began.knows.0, began.held_until.is_some()))
@@ -385,12 +385,12 @@ mod tests {
         assert_eq!(bench.of("part"), Some((part, true)), "it is only expected");
         bench.retired(4);
         assert_eq!(bench.of("part"), Some((anew, false)));
-        // The routine has what it needs anew, and one of its parts is tried again.
+        // The routine has a new lease, and one of its parts is tried again.
         bench.granted(2);
         bench.running(3);
         assert_eq!([bench.of("part"), bench.of("routine")], [Some((anew, false)), Some((routine, true))]);
         assert_eq!(bench.beginnings.others_count(), Some(Revision(routine)));
-        // What it had computed is not true any more: all of it is done anew.
+        // Its computed results are not valid any more: all of it is done again.
         let anew = bench.running(2);
         assert_eq!(bench.of("routine"), Some((anew, false)));
         bench.retired(2);
@@ -406,7 +406,7 @@ mod tests {
         bench.begins(2, "part/expected");
         bench.squashed(2);
         assert_eq!(bench.of("part"), Some((part, true)), "what others change meanwhile counts");
-        // Of those that are real it is the first that counts, whichever ends first.
+        // Of the real parts the first to begin counts, whichever ends first.
         bench.begins(3, "part/expected");
         let first = bench.begins(4, "part/again");
         bench.begins(5, "part/more");
@@ -414,7 +414,7 @@ mod tests {
         bench.squashed(3);
         bench.retired(4);
         assert_eq!(bench.of("part"), Some((first, false)));
-        // Lost once more while another part is under way.
+        // The leases are lost once more while another part is under way.
         bench.begins(6, "part/last");
         bench.loses();
         bench.retired(6);
@@ -466,7 +466,7 @@ states:
             for (number, LogLine { at, entry }) in (1..).zip(&lines) {
                 match entry {
                     LogEntry::Event(event) => {
-                        // Others change something all the time.
+                        // Others change something at every step.
                         let revision = Revision(number);
                         ledger.event(*at, &Event::WorldChanged { revision, facts: Vec::new() });
                         ledger.event(*at, event);

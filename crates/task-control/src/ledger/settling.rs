@@ -1,9 +1,9 @@
-//! Which of a run's operations are done whose answers nobody has heard, where the session that they were for has ended: the resource manager is asked
-//! by their request ids. Pure: what to ask, and what the answers come to.
+//! Settles the operations whose answers were lost with the run's session: the resource manager is asked by their request ids which of them are done.
+//! Pure: which requests to ask about, and what the answers mean.
 //!
-//! Operations are done in order, and of one caller the resource manager forgets the oldest answers first. So what is in front of one that is known was
-//! done; and what is not known was not done where anything older is known. Where nothing is, what takes something away may have been done: then nobody
-//! can say what is to be done, and the run is refused.
+//! Operations are done in order, and the resource manager forgets a caller's oldest answers first. So everything before a known answer was done, and
+//! an unknown one was not done if anything older is known. If nothing is known, an operation that takes something away may have been done: then
+//! nobody can say what is left to do, and the run is refused.
 
 use super::account::Account;
 use super::{Ledger, Operated, operation_request};
@@ -12,32 +12,32 @@ use ratn_model::resource::{OperatedUnits, Requirement, ResourceOperation};
 use ratn_proto::types::Recalled;
 use std::collections::BTreeMap;
 
-/// By request id; `None` where nothing is known of it.
+/// By request id; `None` if no answer is known.
 pub(crate) type Answers = BTreeMap<String, Option<Recalled>>;
 
-/// What the open operations of a run come to.
+/// The result of settling the open operations of a run.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Settled {
-    /// With all that is done.
+    /// The account, with everything that is done.
     pub(crate) account: Account,
-    /// Those that are done, by number, with what each has come to.
+    /// The operations that are done, by number, with the result of each.
     pub(crate) done: Vec<(u64, Vec<Vec<OperatedUnits>>)>,
-    /// Those that are not, in order.
+    /// The operations that are not done, in order.
     pub(crate) open: Vec<Unfinished>,
 }
 
-/// An operation that is not done, or only its first parts.
+/// An operation that is not done, or of which only the first parts are done.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Unfinished {
     pub(crate) number: u64,
     pub(crate) instance: InstanceId,
     pub(crate) operations: Vec<Requirement>,
-    /// What the first of these have come to.
+    /// The results of its first parts, which are done.
     pub(crate) done: Vec<Vec<OperatedUnits>>,
 }
 
 impl Settled {
-    /// How many parts of what is not done take something away, perhaps for good.
+    /// Number of parts not done that take something away, perhaps for good.
     pub(crate) fn removals(&self) -> usize {
         let left = self.open.iter().flat_map(|one| one.operations.iter().skip(one.done.len()));
         left.filter(|operation| takes_away(operation)).count()
@@ -71,7 +71,7 @@ impl Part<'_> {
         takes_away(self.operation())
     }
 
-    /// What it has come to, as far as that was said.
+    /// Its result, as far as the answer says it.
     fn units(&self, answer: &Recalled) -> Option<Vec<OperatedUnits>> {
         let operation = self.operation();
         match (operation.operation, &answer.created) {
@@ -83,7 +83,7 @@ impl Part<'_> {
     }
 }
 
-/// What was created by an operation, under this id.
+/// The result of a create, with the id of the new resource.
 pub(crate) fn created(operation: &Requirement, id: &str) -> OperatedUnits {
     let (resource, kind) = (id.to_owned(), operation.kind.clone());
     OperatedUnits { resource, kind, units: operation.count, ends_with_session: true }
@@ -94,23 +94,23 @@ pub(crate) fn takes_away(operation: &Requirement) -> bool {
     matches!(operation.operation, ResourceOperation::Delete | ResourceOperation::Consume)
 }
 
-/// Whether the resource manager is asked for it.
+/// Whether it is a request to the resource manager.
 fn is_asked_for(operation: &Requirement) -> bool {
     takes_away(operation) || operation.operation == ResourceOperation::Create
 }
 
 impl Ledger {
-    /// The requests that the resource manager is to be asked about; none where no operation is open.
+    /// The requests to ask the resource manager about; none if no operation is open.
     pub(crate) fn unheard_requests(&self) -> Vec<String> {
         let Some(first) = self.operated.first() else { return Vec::new() };
         let older = first.older.iter().cloned();
         older.chain(self.open_parts().map(|part| part.request)).collect()
     }
 
-    /// What the open operations come to by the answers to these.
+    /// Settles the open operations, given the answers to these requests.
     ///
     /// # Errors
-    /// Where that cannot be told any more.
+    /// If it cannot be told any more what was done.
     pub(crate) fn settle(&self, answers: &Answers) -> Result<Settled, Forgotten> {
         let answer = |request: &str| answers.get(request).and_then(Option::as_ref);
         let parts: Vec<Part<'_>> = self.open_parts().collect();
@@ -133,7 +133,7 @@ impl Ledger {
         let mut settled = Settled { account: self.account.clone(), done: Vec::new(), open: Vec::new() };
         for one in &self.operated {
             let Operated { number, instance, operations, .. } = one;
-            // What is not asked for comes to nothing.
+            // An operation that is no request has an empty result.
             let is_done = |index: &usize| first_open.is_none_or(|open| (*number, *index) < open);
             let units = (0..operations.len()).take_while(is_done);
             let units: Vec<_> = units.map(|index| known.remove(&(*number, index)).unwrap_or_default()).collect();
@@ -148,7 +148,7 @@ impl Ledger {
         Ok(settled)
     }
 
-    /// In order, what the resource manager is asked for.
+    /// The parts that are requests to the resource manager, in order.
     fn open_parts(&self) -> impl Iterator<Item = Part<'_>> {
         self.operated.iter().flat_map(|of| {
             let asked_for = of.operations.iter().enumerate().filter(|(_, operation)| is_asked_for(operation));
@@ -179,7 +179,7 @@ mod tests {
         OperatedUnits { resource: resource.to_owned(), kind, units: units.into(), ends_with_session }
     }
 
-    /// A run that has been granted something and then decides these.
+    /// A run that has been granted a lease and then decides these operations.
     fn ledger(operated: &[&[Requirement]]) -> Ledger {
         let instance = InstanceId(1);
         let mut ledger = Ledger { origin: Origin { run: "r".into(), ..Origin::default() }, ..Ledger::default() };
@@ -192,7 +192,7 @@ mod tests {
         ledger
     }
 
-    /// Answers to some of the requests of a ledger, by their place among those that are asked about.
+    /// Answers to some of the requests of a ledger, by their index among those to ask about.
     fn answers(ledger: &Ledger, known: &[(usize, Recalled)]) -> Answers {
         let requests = ledger.unheard_requests();
         known.iter().map(|(place, recalled)| (requests[*place].clone(), Some(recalled.clone()))).collect()

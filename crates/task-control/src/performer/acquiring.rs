@@ -1,5 +1,5 @@
-//! What a run has asked for and has no answer to, and each acquire's way: from asking the resource manager to the event of its answer, or
-//! of the lease that another node of the run has handed over meanwhile.
+//! The acquires of a run without an answer, and the course of each: from the request to the resource manager to the event of its answer, or of the
+//! lease that another node of the run has handed over meanwhile.
 
 use super::{Answer, LONG_BESIDE_OTHERS, OVERDUE, Whom, Withdrawal};
 use crate::decided::{REFUSED_PATIENCE, Unanswered, insist};
@@ -25,22 +25,22 @@ use tokio::sync::mpsc::error::SendError;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-/// What the resource manager says where the deadline of an acquire has passed.
+/// Reason code: the deadline of an acquire has passed.
 const TOO_LATE: &str = "NOT_GRANTED_IN_TIME";
 
 /// An acquire under way.
 #[derive(Debug)]
 pub(super) struct Asking {
     pub(super) request: String,
-    /// Of the run's acquires.
+    /// Its number among the run's acquires.
     pub(super) number: u64,
     pub(super) priority: i64,
     pub(super) requirements: Vec<Requirement>,
     pub(super) since: Instant,
     pub(super) withdrawn: CancellationToken,
-    /// Is cancelled when nothing of it is on its way any more: also what was granted although it is withdrawn has gone back.
+    /// Cancelled when nothing of the acquire is under way any more: a lease that was granted after the withdrawal has gone back, too.
     pub(super) over: CancellationToken,
-    /// Takes a lease in place of the manager's answer; `None` once it has one.
+    /// Takes a lease in place of the manager's answer; `None` once a lease was handed over.
     pub(super) hand: Option<oneshot::Sender<Lease>>,
 }
 
@@ -63,7 +63,7 @@ impl Asking {
 #[derive(Debug, Default)]
 pub(super) struct Waiting {
     asking: BTreeMap<InstanceId, Asking>,
-    /// In the order in which the resource manager serves those that want the same.
+    /// In the order in which the resource manager serves equal requests.
     order: BTreeMap<(Reverse<i64>, u64), InstanceId>,
 }
 
@@ -84,28 +84,28 @@ impl Waiting {
         self.asking.get(&instance)
     }
 
-    /// Who waits, whoever comes first before the others.
+    /// The waiting acquires, in the order in which they are served.
     pub(super) fn in_order(&self) -> impl Iterator<Item = (InstanceId, &Asking)> {
         self.order.values().filter_map(|instance| Some((*instance, self.asking.get(instance)?)))
     }
 
-    /// Who has waited longest for an answer.
+    /// The acquire that has waited longest for an answer.
     pub(super) fn longest(&self) -> Option<(InstanceId, &Asking)> {
         let longest = self.asking.iter().min_by_key(|(_, asking)| asking.since)?;
         Some((*longest.0, longest.1))
     }
 
-    /// Hands a lease to one that waits; nothing where it does not.
+    /// Hands a lease to a waiting instance; `None` if the instance does not wait.
     ///
     /// # Errors
-    /// Where it has its answer, or another lease, already.
+    /// If it already has its answer or another lease.
     pub(super) fn hand(&mut self, to: InstanceId, lease: &Lease) -> Option<Result<(), ()>> {
         let hand = self.asking.get_mut(&to)?.hand.take();
         Some(hand.ok_or(()).and_then(|hand| hand.send(lease.clone()).map_err(drop)))
     }
 }
 
-/// What performs goals says where it is: a resource of that kind that does not is nobody's to give a goal to, whoever made it.
+/// A goal can be given only to a resource that says its endpoint, so the acquire of a performer's kind requires one, whoever created the resource.
 fn of_performers(catalogue: &Catalogue, requirement: &mut Requirement) {
     let performs = catalogue.providers.values().any(|provider| provider.resource == requirement.kind);
     if performs && requirement.operation == ResourceOperation::Block {
@@ -113,15 +113,15 @@ fn of_performers(catalogue: &Catalogue, requirement: &mut Requirement) {
     }
 }
 
-/// One acquire's way.
+/// The course of one acquire.
 pub(super) struct Acquiring {
     pub(super) instance: InstanceId,
     pub(super) requirements: Vec<Requirement>,
     pub(super) catalogue: Arc<Catalogue>,
     pub(super) options: AcquireOptions,
-    /// So long its instance has waited before, with other priorities.
+    /// How long its instance has waited before, with other priorities.
     pub(super) waited: Duration,
-    /// It leaves when these operations of the run are done: each token is cancelled then.
+    /// The request is sent when these operations of the run are done: each token is cancelled then.
     pub(super) after: Vec<CancellationToken>,
     pub(super) withdrawn: CancellationToken,
     pub(super) handed: oneshot::Receiver<Lease>,
@@ -129,19 +129,19 @@ pub(super) struct Acquiring {
     pub(super) trust: Trust,
     pub(super) told: Told,
     pub(super) whom: Whom,
-    /// Tells [`Asking::over`] when the last of it is dropped.
+    /// Cancels [`Asking::over`] when its last clone is dropped.
     pub(super) over: Arc<DropGuard>,
 }
 
 enum Got {
     Handed(Lease),
     Answer(Result<(Lease, Vec<HolderNote>), CallError>),
-    /// It is not wanted any more.
+    /// The acquire was withdrawn.
     Nothing,
 }
 
 impl Acquiring {
-    /// Until its answer, which goes to the shell. The resource manager is not asked where a lease is handed over at once.
+    /// Waits for the answer and sends it to the shell. If a lease is handed over at once, the resource manager is not asked.
     pub(super) async fn ask(mut self, events: mpsc::Sender<Answer>) {
         if let Ok(lease) = self.handed.try_recv() {
             self.tell(Event::Granted { instance: self.instance, lease }, &events).await;
@@ -149,7 +149,7 @@ impl Acquiring {
         }
         self.requirements.iter_mut().for_each(|one| of_performers(&self.catalogue, one));
         if !self.operations_are_done().await {
-            // It has not asked yet. What was handed to it before it was withdrawn goes back.
+            // The request was not sent. A lease that was handed over before the withdrawal goes back.
             self.handed.close();
             if let Ok(lease) = self.handed.try_recv() {
                 self.tell(Event::Granted { instance: self.instance, lease }, &events).await;
@@ -158,10 +158,10 @@ impl Acquiring {
         }
         let unheard = AtomicBool::new(false);
         let got = self.got(&unheard).await;
-        // Whoever hands something over from now on keeps it.
+        // From now on a lease can no longer be handed over.
         self.handed.close();
         let got = match (self.handed.try_recv(), got) {
-            // What the manager granted at the same moment goes back with the withdrawal.
+            // A grant by the manager at the same moment goes back with the withdrawal.
             (Ok(lease), _) | (_, Got::Handed(lease)) => Got::Handed(lease),
             (_, got) => got,
         };
@@ -187,7 +187,7 @@ impl Acquiring {
         self.tell(event, &events).await;
     }
 
-    /// Waits for the operations that it comes behind; false where it is withdrawn before they are done.
+    /// Waits for the operations before this acquire; false if it is withdrawn before they are done.
     async fn operations_are_done(&self) -> bool {
         for operation in &self.after {
             tokio::select! {
@@ -233,34 +233,34 @@ impl Acquiring {
                 () = self.withdrawn.cancelled() => return Got::Nothing,
                 // A manager that does not answer is waited for until the run gives its session up ([`super::Performer::lost`]).
                 answer = retry_until_answered(REFUSED_PATIENCE, ask) => match answer {
-                    // It goes on waiting, with the time that it has waited. When it is needed for certain, it asks anew.
+                    // A speculative acquire goes on waiting, with the time that it has waited. If it becomes certain, it is requested anew.
                     Err(error) if self.options.speculative && error.reason() == TOO_LATE => continue,
                     answer => return Got::Answer(answer),
                 },
-                // Others are not let pass any more.
+                // It has waited too long beside other runs: asks again as overdue.
                 () = self.told.others_after(late), if may_be_late => {}
             }
             tokio::select! {
                 biased;
                 Ok(lease) = &mut self.handed, if !self.handed.is_terminated() => return Got::Handed(lease),
                 () = self.withdrawn.cancelled() => return Got::Nothing,
-                // What is asked for twice would be had twice.
+                // The first request is withdrawn, because both could be granted.
                 () = withdraw(&self.resources, &self.trust, &self.options.request) => {}
             }
-            // Another request: a manager that was started again has not heard of the first, and refuses what was withdrawn before it came.
+            // A new request id: a restarted manager has not heard of the first request, and refuses a request that was withdrawn before it came.
             let late = late_request(&self.options.request);
             self.options.instead_of = std::mem::replace(&mut self.options.request, late);
             self.options.priority = OVERDUE;
         }
     }
 
-    /// The call is dropped; what was granted meanwhile goes back.
+    /// Withdraws the request; a lease that was granted meanwhile goes back.
     async fn withdraw(&self) {
         withdraw(&self.resources, &self.trust, &self.options.request).await;
     }
 
-    /// What an answer of the resource manager is to the executive, once the run has been told what whoever had the resources before left.
-    /// `None` where it is not wanted any more before that: then it goes back, and what was left stays to be told to whoever comes next.
+    /// The event of an answer of the resource manager, once the run has been told the notes of earlier holders. `None` if the acquire is withdrawn
+    /// before: then the lease goes back, and the notes remain for its next holder.
     async fn event_of(&self, answer: Result<(Lease, Vec<HolderNote>), CallError>) -> Option<Event> {
         let instance = self.instance;
         let (lease, notes) = match answer {
@@ -285,7 +285,7 @@ async fn withdraw(resources: &ResourceClient, trust: &Trust, request: &str) {
     }
 }
 
-/// Why nothing was granted; the bound that was reached is in the resource manager's words, with its name.
+/// The reason of a refusal; a bound that was reached is named in the resource manager's words.
 fn refused(error: &CallError) -> String {
     let reason = said(error);
     match (error.is_crash(), error.again_after()) {

@@ -1,4 +1,4 @@
-//! Which runs may be under way beside each other: each is a resource of its session, which the others see.
+//! Which runs may be under way beside each other: each run has a resource in its session, which the other runs see.
 
 use super::told::Told;
 use crate::NotStarted;
@@ -10,9 +10,9 @@ use ratn_proto::types::Resource;
 use ratn_worker::client::{ResourceClient, retry_unanswered};
 use std::time::Duration;
 
-/// So many runs are under way on a system at the most.
+/// Maximum number of runs under way on a system.
 const MOST_RUNS: usize = 64;
-/// So often a run looks whether others are under way.
+/// Interval at which a run checks whether others are under way.
 const LOOK_AGAIN: Duration = Duration::from_secs(1);
 /// The attributes of the resource that says that a run is under way: its task,
 const TASK: &str = "task";
@@ -21,16 +21,16 @@ const ALONE: &str = "alone";
 /// The kind of that resource, whose id is the run's.
 pub const RUN_KIND: &str = "Run";
 
-/// A run begins on a system; whether others are under way. It goes beside them, unless it or one of them is to be `alone`. The resource that
-/// says so, of its id, goes with its session.
+/// Marks a run as under way on a system; true if others are. It runs beside them, unless it or one of them is to be `alone`. The mark is a resource
+/// with the run's id, which vanishes with the run's session.
 ///
 /// # Errors
-/// Where it may not begin beside what is under way, it is under way already, or the resource manager cannot be asked.
+/// If it may not run beside those under way, if it is under way already, or if the resource manager cannot be asked.
 pub async fn claim(resources: &ResourceClient, run: &str, task: &str, alone: bool) -> anyhow::Result<bool> {
     claim_as("", resources, run, task, alone).await
 }
 
-/// The same, under a request id that who comes back knows; under a fresh one where it is empty.
+/// Like `claim`, under a request id that a resumption knows; under a fresh one if `request` is empty.
 pub(super) async fn claim_as(
     request: &str,
     resources: &ResourceClient,
@@ -38,7 +38,7 @@ pub(super) async fn claim_as(
     task: &str,
     alone: bool,
 ) -> anyhow::Result<bool> {
-    // Before it is seen by others: one that is refused is in nobody's way.
+    // Checked before others see the mark: a refused run is in nobody's way.
     others(resources, run, alone).await?;
     let claim = Resource::new(run, ResourceClass::Task, RUN_KIND)
         .with_attribute(TASK, Value::String(task.to_owned()))
@@ -50,11 +50,11 @@ pub(super) async fn claim_as(
         }
         Err(error) => bail!("cannot begin the run: {}", said(&error)),
     }
-    // Of two that begin at the same moment each sees the other one.
+    // If two runs begin at the same moment, each sees the other.
     others(resources, run, alone).await
 }
 
-/// Keeps up whether other runs are under way on the system.
+/// Reports to `told` repeatedly whether other runs are under way on the system.
 pub(super) async fn look_for_others(resources: ResourceClient, run: String, told: Told) {
     loop {
         tokio::time::sleep(LOOK_AGAIN).await;
@@ -64,7 +64,7 @@ pub(super) async fn look_for_others(resources: ResourceClient, run: String, told
     }
 }
 
-/// Whether other runs are under way, beside which this one may be.
+/// Whether other runs are under way; an error if this one may not run beside them.
 async fn others(resources: &ResourceClient, run: &str, alone: bool) -> anyhow::Result<bool> {
     let runs = retry_unanswered(|| resources.list(&[RUN_KIND])).await;
     let runs = runs.map_err(|error| anyhow::anyhow!("cannot begin the run: {}", said(&error)))?;

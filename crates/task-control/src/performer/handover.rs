@@ -1,14 +1,15 @@
-//! Leases that go from one node to the next without the resource manager: where a goal ends well and the next node wants exactly what
-//! it had, giving it back and asking for it again would cost two calls and come to the same.
+//! Leases that go from one node to the next without the resource manager: if a goal ends well and the next node wants exactly what it had, a release
+//! and an acquire would cost two calls and have the same result.
 //!
-//! The resource manager sees one lease that lives longer, so others get their turn: after [`TURN`] it goes back all the same, and nothing is handed
-//! over beside other runs, whose nodes may come first. Within the run the
-//! order is the resource manager's: who comes first of those that want any of it takes it over, also one that waits there already, whose
-//! request is then withdrawn ([`super::acquiring`]); where that one wants something else, too, nothing is handed over. What depends on the state of a resource (attributes,
-//! conditions, what is there or is used up) is asked anew every time.
+//! The resource manager sees one lease that lives longer. So that others get their turn, the lease goes back after [`TURN`], and nothing is handed
+//! over beside other runs, whose nodes may come first. Within the run the order is the resource manager's: the first of those that want any of its
+//! resources takes the lease over. If that one waits at the manager already, its request is withdrawn ([`super::acquiring`]); if it wants something
+//! else, too, nothing is handed over. What depends on the state of a resource (attributes, conditions, existence, consumption) is requested anew
+//! every time.
 //!
-//! For a lease that went back the manager grants one to the first that waits there. That one is left to it: handed another lease meanwhile, it would
-//! withdraw its request, the manager would grant the next one, which has a lease by then, too, and so on, with a resource that nobody works with.
+//! When a lease goes back, the manager grants one to the first waiting node, so that node is left to the manager. If another lease were handed to it
+//! meanwhile, it would withdraw its request; the manager would grant the next node, which has a lease by then, too; and so on, with a resource that
+//! nobody works with.
 
 use super::acquiring::Waiting;
 use ratn_executive::protocol::{CERTAIN, Command, Event};
@@ -18,18 +19,17 @@ use ratn_model::resource::{Lease, Requirement, ResourceOperation};
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-/// How long after its grant a lease may be handed over: so much longer somebody outside this run may wait.
+/// How long after its grant a lease may be handed over; somebody outside this run may wait so much longer.
 const TURN: Duration = Duration::from_millis(100);
 
-/// How long the manager's grant for a lease that went back is expected: another client may have got it. The first that waits may be passed
-/// over for so long.
+/// How long the manager's grant for a returned lease is expected: another client may have got it. For so long the first waiting node may be passed over.
 const EXPECTED: Duration = TURN;
 
 /// The leases of a run, with what was asked for.
 #[derive(Debug, Default)]
 pub(super) struct Leases {
     held: BTreeMap<LeaseId, Held>,
-    /// What went back, and when: for each of these the manager has a grant for whoever comes first of those that want exactly that.
+    /// Returned leases: what was requested for each, and when it went back. For each, the manager has a grant for the first that wants exactly the same.
     went_back: Vec<(Vec<Requirement>, Instant)>,
 }
 
@@ -38,23 +38,23 @@ struct Held {
     lease: Lease,
     requirements: Vec<Requirement>,
     granted: Instant,
-    /// Who has it now,
+    /// The instance that has it now,
     holder: InstanceId,
-    /// and whether that asked for it in case it is needed.
+    /// and whether that instance asked for it speculatively.
     is_speculative: bool,
 }
 
-/// A lease that is handed over.
+/// A lease to hand over.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Handover {
     pub(super) to: InstanceId,
     pub(super) lease: Lease,
-    /// Whether that waits already; else it asks in this very step.
+    /// Whether that instance waits already; else it asks in this very step.
     pub(super) waits: bool,
 }
 
 impl Leases {
-    /// A lease is there; one that was handed over counts from its grant.
+    /// A lease was granted or handed over; the time of a handed-over lease counts from its grant.
     pub(super) fn granted(&mut self, to: InstanceId, lease: &Lease, asked: (Vec<Requirement>, i64), now: Instant) {
         let (requirements, priority) = asked;
         let is_speculative = priority < CERTAIN;
@@ -68,12 +68,12 @@ impl Leases {
         (held.holder, held.is_speculative) = (to, is_speculative);
     }
 
-    /// Whether any lease was asked for in case it is needed.
+    /// Whether any lease was requested speculatively.
     pub(super) fn has_speculative(&self) -> bool {
         self.held.values().any(|held| held.is_speculative)
     }
 
-    /// Who has a lease that was asked for in case it is needed.
+    /// The holder of a lease that was requested speculatively.
     pub(super) fn speculative_holder(&self, lease: LeaseId) -> Option<InstanceId> {
         self.held.get(&lease).filter(|held| held.is_speculative).map(|held| held.holder)
     }
@@ -86,14 +86,13 @@ impl Leases {
         }
     }
 
-    /// How many grants of exactly this the manager has for the run, for what went back.
+    /// Number of expected grants by the manager for exactly these requirements, because such leases went back.
     fn expected(&self, requirements: &[Requirement], now: Instant) -> usize {
         let is_expected = |at: &Instant| now.duration_since(*at) < EXPECTED;
         self.went_back.iter().filter(|(returned, at)| returned == requirements && is_expected(at)).count()
     }
 
-    /// Who takes over the lease that is given back for this event, if anybody does: whoever comes first of those that wait already and those
-    /// that ask now.
+    /// The handover of the lease that this event gives back, if there is one: to the first of those that wait already and those that ask now.
     pub(super) fn handover(
         &self,
         event: &Event,
@@ -113,7 +112,7 @@ impl Leases {
         let is_withdrawn = |instance: InstanceId| {
             commands.iter().any(|command| matches!(command, Command::Withdraw { instance: one } if *one == instance))
         };
-        // One that asks again with another priority is withdrawn before.
+        // An instance that asks again with another priority is withdrawn before.
         let mut waits =
             waiting.in_order().map(|(id, asking)| (id, asking.requirements.as_slice(), true, asking.priority));
         let mut expected = self.expected(&held.requirements, now);
@@ -131,10 +130,10 @@ impl Leases {
             }
             _ => None,
         });
-        // Of equals the first, and who waits already is before who asks now.
+        // Of equal priorities the first; those that wait already come before those that ask now.
         let first = asks.filter(|(_, requirements, ..)| held.is_wanted(requirements)).chain(waits);
         let (to, requirements, waits, priority) = first.max_by_key(|(.., priority)| *priority)?;
-        // What is needed for certain is not passed over for what may not be: the manager may have nothing for it after all.
+        // A certain node that was left to the manager is not passed over for a speculative one: the manager may have nothing for it after all.
         if left_is_certain && priority < CERTAIN {
             return None;
         }
@@ -143,7 +142,7 @@ impl Leases {
 }
 
 impl Held {
-    /// Whether any of its resources is what is asked for.
+    /// Whether the requirements include the kind of any of its resources.
     fn is_wanted(&self, requirements: &[Requirement]) -> bool {
         requirements.iter().any(|wanted| self.lease.resources.iter().any(|resource| resource.is_a(&wanted.kind)))
     }
@@ -190,7 +189,7 @@ mod tests {
         Command::Acquire { instance: InstanceId(instance), requirements, priority }
     }
 
-    /// Those that wait already, with their priorities; the first has the id 11.
+    /// Waiting acquires with their priorities; the first has the id 11.
     fn waiting(all: &[(Vec<Requirement>, i64)]) -> Waiting {
         let mut waiting = Waiting::default();
         for ((requirements, priority), number) in all.iter().zip(1..) {
@@ -200,7 +199,7 @@ mod tests {
         waiting
     }
 
-    /// Of a planner's lease that is given back after so many milliseconds, in a step with these acquires.
+    /// The handover of a planner's lease that is given back after so many milliseconds, in a step with these acquires.
     fn handover(
         event: &Event,
         asks: &[Command],

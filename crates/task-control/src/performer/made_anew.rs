@@ -1,8 +1,8 @@
-//! Coming back to a run whose session has ended: which of its operations are done is asked of the resource manager, what went with the session is made
-//! so again, and the rest is done.
+//! Resuming a run whose session has ended: asks the resource manager which of the run's operations are done, makes again what went with the session,
+//! and performs the rest.
 //!
-//! Nothing that is made so again outlasts the new session, and what is done for the first time is done under its own request id. So a resumption that
-//! dies on the way leaves nothing that the next one does not find.
+//! Nothing that is made again outlasts the new session, and an operation that is done for the first time is done under its own request id. So a
+//! resumption that dies on the way leaves nothing that the next one does not find.
 
 use super::Performer;
 use crate::decided::{Unanswered, Undone, insist};
@@ -14,28 +14,27 @@ use ratn_model::resource::{OperatedUnits, Requirement, ResourceOperation};
 use ratn_worker::client::retry_unanswered;
 use std::collections::BTreeMap;
 
-/// As the resource manager names a resource that is not there.
+/// Reason code: the resource does not exist.
 const GONE: &str = "RESOURCE_UNKNOWN";
 
-/// What the run had created before, under its new ids.
+/// The resources that the run had created: old id to new id.
 type Renamed = BTreeMap<String, String>;
 
 impl Performer {
-    /// What has become of the operations of the run whose answers nobody has heard, where its session has ended; of one that lives they are asked for
-    /// again.
+    /// Settles the operations without an answer of a run whose session has ended; if the session lives, they are simply requested again.
     pub(super) async fn settle(&self, ledger: &Ledger) -> anyhow::Result<Settled> {
         let requests = ledger.unheard_requests();
         let answers = match retry_unanswered(|| self.resources.recall(&requests)).await {
             Ok(answers) => requests.into_iter().zip(answers).collect(),
-            // It knows nothing of that: an earlier version.
+            // A manager of an earlier version, which has no such call.
             Err(error) if error.code() == Some(tonic::Code::Unimplemented) => Answers::new(),
             Err(error) => return Err(error.into()),
         };
         Ok(ledger.settle(&answers)?)
     }
 
-    /// The old session is gone with what it had made and used up: that is made so again. What others had made and the run deleted is gone for good,
-    /// as is some of what it used up. Then what was not done is done. What the log is to say of that.
+    /// Makes again what the run had created and used up in its old session. Others' resources that the run deleted stay deleted, as does some of what
+    /// it used up. Then performs the open operations. Returns the events for the log.
     pub(super) async fn make_anew(&self, settled: Settled, before: &Ledger) -> anyhow::Result<Vec<Event>> {
         let Settled { account, done, open } = settled;
         if let Some(operation) = account.unknown() {
@@ -62,7 +61,7 @@ impl Performer {
         Ok(told)
     }
 
-    /// What the run had created is there again; its new ids by those of before.
+    /// Creates the run's resources again; returns the new ids by the old ones.
     async fn create_anew(&self, account: &Account) -> anyhow::Result<Renamed> {
         let mut renamed = BTreeMap::new();
         for (index, Created { resource, left }) in account.created().iter().enumerate() {
@@ -75,7 +74,8 @@ impl Performer {
         Ok(renamed)
     }
 
-    /// What the run had used up of what returned, or is there again, is used up, of the same resources. What has gone since has gone with that.
+    /// Uses up again, of the same resources, what the run had used up of units that have returned and of resources that exist again. If a resource has
+    /// gone since, its consumption has gone with it.
     async fn use_up_anew(&self, account: &Account, renamed: &Renamed) -> anyhow::Result<()> {
         for (index, (resource, UsedUp { kind, units })) in account.used_up().enumerate() {
             let resource = renamed.get(resource).map_or(resource, String::as_str);
@@ -91,7 +91,7 @@ impl Performer {
         Ok(())
     }
 
-    /// Does the rest of an operation.
+    /// Performs the rest of an operation.
     async fn operate_anew(&self, unfinished: Unfinished, renamed: &Renamed) -> anyhow::Result<Event> {
         let Unfinished { number, instance, operations, done } = unfinished;
         let first = done.len();

@@ -1,5 +1,5 @@
-//! Performs the executive's commands: asks the resource manager, gives goals to providers, hands what needs an order to
-//! [`super::record`]. Never waits: every answer comes back as an event.
+//! Performs the executive's commands: asks the resource manager, gives goals to providers, and passes what has to be done in order to
+//! [`super::record`]. It never waits: every answer comes back as an event.
 
 mod acquiring;
 mod came_between;
@@ -64,28 +64,28 @@ use tokio_util::task::AbortOnDropHandle;
 use told::Told;
 use wanted::HoldsSpeculatively;
 
-/// A resource manager that does not open a session within this time is not there.
+/// A resource manager that does not open a session within this time counts as absent.
 const SESSION_DEADLINE: Duration = Duration::from_secs(5);
-/// A task that waits this long for its resources has waited in vain.
+/// Maximum time for which a task waits for its resources.
 const ACQUIRE_DEADLINE: Duration = Duration::from_secs(3600);
-/// What waits longer than this while nothing is done is said, and
+/// A wait longer than this is reported if no goal is under way, and
 const LONG_WHILE_IDLE: Duration = Duration::from_secs(4);
-/// what waits longer than this in any case.
+/// a wait longer than this in any case.
 const LONG: Duration = Duration::from_secs(30);
-/// What is needed and waits longer than this beside other runs comes next: of what does, what waits longest.
+/// A certain acquire that waits longer than this beside other runs comes next; of several, the one that has waited longest.
 const LONG_BESIDE_OTHERS: Duration = Duration::from_secs(2);
-/// The priority with which it asks then; nobody else does.
+/// The priority of such an acquire; no other acquire has it.
 const OVERDUE: i64 = i64::MAX;
-/// At the end of a run, for everything that is still being recorded or given back.
+/// Time limit at the end of a run for everything that is still being recorded or given back.
 const CLOSE_DEADLINE: Duration = Duration::from_secs(3);
-/// At the end of a run, for its operations, and for the leases that have to be back before something is used up or deleted: for longer than a
-/// resource manager that is away is waited for.
+/// Time limit at the end of a run for its operations, and for the leases that have to be back before something is used up or deleted: longer than an
+/// absent resource manager is waited for.
 const RETURN_DEADLINE: Duration = Duration::from_secs(15);
 
-/// A holder's name has so many characters at the most, half of it the task's: the resource manager takes 128 unless told otherwise.
+/// Maximum length of a holder's name in characters, half of it for the task: the resource manager takes 128 unless configured otherwise.
 const MAX_HOLDER: usize = 120;
 
-/// Who holds a lease, for people: the task and the state, of a longer path its end.
+/// The holder of a lease, for people: the task, and the path of the state (of a long path, its end).
 fn holder(task: &str, path: &str) -> String {
     let task: String = task.chars().take(MAX_HOLDER / 2).collect();
     let room = MAX_HOLDER - task.chars().count() - ": …".chars().count();
@@ -95,15 +95,15 @@ fn holder(task: &str, path: &str) -> String {
     }
 }
 
-/// Whether a session was opened by a resumption that died before the run was in it what it had been: nothing in it is the run's. `before` is the
-/// number of the run's own, 0 where that is not known.
+/// Whether a session was opened by a resumption that died before it had restored the run's resources in it: then nothing in it is the run's. `before`
+/// is the number of the run's own session, 0 if unknown.
 fn is_of_a_resumption(session: &Session, before: Option<u64>) -> bool {
     let state = session.state();
     let SessionState { found, number, .. } = *state.borrow();
     found && before.is_some_and(|before| before != 0 && number != 0 && before != number)
 }
 
-/// Who is asked where something is not told in time.
+/// The clients to ask if something is not told in time.
 struct Whom {
     resources: ResourceClient,
     world: WorldClient,
@@ -128,27 +128,27 @@ fn beside_others(priority: i64, urgency: Urgency) -> i64 {
     ((priority & CERTAIN) | ((urgency as i64) << OWN_BITS) | own).min(OVERDUE - 1)
 }
 
-/// What is on its way to the executive.
+/// A message on its way to the executive.
 #[derive(Debug)]
 pub(super) enum Answer {
     /// An event.
     Event {
         event: Box<Event>,
-        /// Of an acquire: whether it was withdrawn meanwhile.
+        /// For an acquire: how to tell whether it was withdrawn meanwhile.
         withdrawn: Option<Withdrawal>,
     },
-    /// A revision of the root: the run's own, or another's.
+    /// A revision of the root, by this run or another.
     World(WorldChange),
-    /// Another run waits for what these leases hold, and needs it for certain.
+    /// Another run waits for the resources of these leases, and certainly needs them.
     Wanted(Vec<LeaseId>),
 }
 
-/// What the answer of an acquire knows of its withdrawal.
+/// The withdrawal of an acquire, as its answer knows it.
 #[derive(Debug)]
 pub(super) struct Withdrawal {
-    /// Cancelled when it is withdrawn.
+    /// Cancelled when the acquire is withdrawn.
     token: CancellationToken,
-    /// Is held until what was granted all the same has gone back.
+    /// Held until a lease that was granted all the same has gone back.
     over: Arc<DropGuard>,
 }
 
@@ -158,7 +158,7 @@ impl From<Event> for Answer {
     }
 }
 
-/// One run's hands.
+/// Performs the commands of one run.
 pub(super) struct Performer {
     run: String,
     program: Arc<Program>,
@@ -173,51 +173,51 @@ pub(super) struct Performer {
     channels: Channels,
     world: WorldClient,
     session: Session,
-    /// Its number at the manager.
+    /// The number of the session at the manager.
     number: u64,
-    /// Whether who comes back has found it, with all that the run has in it.
+    /// Whether a resumption has found the run's own session, with everything that the run has in it.
     is_own: bool,
-    /// Whether the run has what it had.
+    /// Whether the run's session lives.
     trust: Trust,
-    /// Where the session is kept alive, whatever this thread does.
+    /// Runs the keep-alive of the session, whatever this thread does.
     _background: BackgroundRuntime,
-    /// Look for other runs, and for what they need.
+    /// Tasks that look for other runs, and for what those need.
     _others: [AbortOnDropHandle<()>; 2],
     events: mpsc::Sender<Answer>,
     records: mpsc::Sender<Record>,
-    /// Performs these.
+    /// The task that performs the records.
     recorder: AbortOnDropHandle<()>,
-    /// Whom it waits for.
+    /// What the recorder waits for.
     recording: Recording,
     /// How far the pool's root is known.
     root: Root,
     outside: Outside,
-    /// Of a run that came back without what it held, while anything of before is under way.
+    /// For a run that was resumed without its leases: while anything from before is under way.
     came_between: Option<CameBetween>,
-    /// What went back while commits were on their way.
+    /// Leases that were given back while commits were under way.
     left: Left,
     told: Told,
     /// The run's own number of its last commit.
     decided: Revision,
-    /// Hears of the root's revisions.
+    /// The task that receives the root's revisions.
     following: Option<AbortOnDropHandle<()>>,
     cancelled: Cancelled,
     recorded: Recorded,
-    /// How much of that the executive was told.
+    /// How much of `recorded` the executive was told.
     heard: Confirmed,
-    /// Ids for projections that goals are given before they are there.
+    /// Promised ids of projections: goals may start before these exist.
     promises: Promises,
     making: Making,
-    /// Nothing begins any more.
+    /// Cancelled when nothing may begin any more.
     over: CancellationToken,
     asking: Waiting,
-    /// Since when instances have waited that have not got what they need, however often they ask; and how they asked last.
+    /// Since when each instance has waited without getting what it needs, however often it asked; and its last request.
     waiting_since: BTreeMap<InstanceId, (Instant, LastAsked)>,
     leases: Leases,
     holds: HoldsSpeculatively,
-    /// What the instances of the window are called, for whoever asks who holds something.
+    /// The paths of the instances in the window, to name the holders of leases.
     paths: BTreeMap<InstanceId, String>,
-    /// Of the commands that are performed now.
+    /// The handover by the present commands.
     handover: Option<Handover>,
     jobs: BTreeMap<InstanceId, Job>,
     stopping: Stopping,
@@ -225,13 +225,13 @@ pub(super) struct Performer {
     order: Operations,
     acquires: u64,
     operations: u64,
-    /// How often task control has come back to this run.
+    /// How often the run has been resumed.
     resumptions: u32,
-    /// Of the run.
+    /// The run's place in its trace.
     trace: TraceContext,
 }
 
-/// How an instance asked last.
+/// The last request of an instance.
 #[derive(Debug, Clone)]
 struct LastAsked {
     request: String,
@@ -239,7 +239,7 @@ struct LastAsked {
 }
 
 impl LastAsked {
-    /// The id under which it is in the queue after so long: what is needed for certain and has waited for long asks once more.
+    /// Its request id in the queue after this time: a certain request that has waited long is repeated under another id.
     fn in_queue(self, waited: Duration) -> String {
         let is_late = self.priority >= CERTAIN && waited >= LONG_BESIDE_OTHERS;
         if is_late { late_request(&self.request) } else { self.request }
@@ -248,19 +248,19 @@ impl LastAsked {
 
 struct Job {
     attempt: u32,
-    /// What it works under; a routine's serves several jobs.
+    /// The lease that it works under; a routine's lease serves several jobs.
     lease: Option<LeaseId>,
-    /// The resource that performs it; empty without one.
+    /// The resource that performs it; empty if there is none.
     resource: String,
     stop: CancellationToken,
     ended: JoinHandle<()>,
-    /// Is cancelled when it has ended.
+    /// Cancelled when it has ended.
     over: CancellationToken,
 }
 
 impl Performer {
-    /// Opens the run's session and begins to listen to commands. The session has the run's id, so that whoever resumes the run
-    /// goes on with it; `before` is its number by the run's log. `trace` is the place of the run in its trace.
+    /// Opens the run's session and begins to accept commands. The session has the run's id, so that whoever resumes the run continues it; `before` is
+    /// its number by the run's log. `trace` is the place of the run in its trace.
     pub(super) async fn connect(
         place: &Place,
         run: &str,
@@ -273,7 +273,7 @@ impl Performer {
         let run = run.to_owned();
         let manager = &place.endpoints.resource_manager;
         let background = BackgroundRuntime::start("session").context("cannot keep a session alive")?;
-        // Over a connection of its own.
+        // The session has a connection of its own.
         let standing = place.standing;
         let open = || {
             let channels = Channels::new(&place.tls);
@@ -297,7 +297,7 @@ impl Performer {
         let request = if is_own { String::new() } else { claim_request(&run, number) };
         match claim_as(&request, &resources, &run, &program.name, place.alone).await {
             Ok(has_others) => told.beside_others(has_others),
-            // What a run that comes back holds is still its own.
+            // What a resumed run holds is still its own.
             Err(refused) if is_own => {
                 session.abandon().await;
                 return Err(refused);
@@ -383,14 +383,14 @@ impl Performer {
         })
     }
 
-    /// The root world as it is now; of every revision after it [`Performer::accept`] will hear.
+    /// The root world as it is now; [`Performer::accept`] receives every later revision.
     pub(super) async fn root(&mut self) -> anyhow::Result<(Revision, Vec<(FactKey, Value)>)> {
         let (revision, facts) = retry_unanswered(|| self.world.root()).await?;
         self.follow(revision);
         Ok((revision, facts.into_iter().map(|fact| (fact.key, fact.value)).collect()))
     }
 
-    /// Hears of every revision of the root after this one.
+    /// Receives every revision of the root after this one.
     fn follow(&mut self, after: Revision) {
         self.root.reached(after);
         self.told.root(after);
@@ -398,7 +398,7 @@ impl Performer {
         self.following = Some(AbortOnDropHandle::new(tokio::spawn(following)));
     }
 
-    /// How far what was decided is done.
+    /// How far the decisions are performed.
     pub(super) fn confirmed(&self) -> Confirmed {
         *self.recorded.borrow()
     }
@@ -408,13 +408,13 @@ impl Performer {
         self.heard = confirmed;
     }
 
-    /// Resolves when the session with the resource manager, and with it every lease, is gone. A manager that is not heard is waited for,
-    /// also with a motion under way: its provider has it stand still meanwhile, and one that was suspended still knows what the run holds.
+    /// Resolves when the session with the resource manager, and with it every lease, is gone. A silent manager is waited for, also with a motion
+    /// under way: its provider keeps the robot at standstill meanwhile, and a manager that was suspended still knows what the run holds.
     pub(super) async fn lost(&self) {
         self.session.gone().await;
     }
 
-    /// What the executive made of an event is performed next, all of it.
+    /// Prepares for all commands of an event; they are performed next.
     pub(super) fn prepare(&mut self, event: &Event, commands: &[Command]) {
         for command in commands {
             match command {
@@ -428,16 +428,16 @@ impl Performer {
                 _ => {}
             }
         }
-        // Beside other runs it is the resource manager's to say who comes next. What goes back may be what the run uses up.
+        // Beside other runs the resource manager decides who comes next. A lease that goes back may contain what the run uses up.
         let operates = |command: &Command| matches!(command, Command::Operate { .. });
         let is_free = !self.told.has_others() && self.order.operating.is_empty() && !commands.iter().any(operates);
         let handover = is_free.then(|| self.leases.handover(event, commands, &self.asking, Instant::now()));
         self.handover = handover.flatten();
-        // To one whose answer is on its way nothing is handed over: the lease goes back.
+        // Nothing is handed to an instance whose answer is under way: the lease goes back.
         self.handover.take_if(|one| one.waits && self.asking.hand(one.to, &one.lease) != Some(Ok(())));
     }
 
-    /// What instances are called that were expanded before this performer was there.
+    /// Adds the paths of instances that were expanded before this performer existed.
     pub(super) fn know(&mut self, paths: &BTreeMap<InstanceId, String>) {
         self.paths.extend(paths.iter().map(|(instance, path)| (*instance, path.clone())));
     }
@@ -447,7 +447,7 @@ impl Performer {
         self.number
     }
 
-    /// What the run is beside others.
+    /// The standing of the run beside others.
     pub(super) fn standing(&self) -> Standing {
         self.standing
     }
@@ -457,12 +457,12 @@ impl Performer {
         &self.run
     }
 
-    /// Begins to perform a command, where it cannot be undone when everything before it is safe.
+    /// Begins to perform a command; an irreversible one only when everything before it is safe on disk.
     pub(super) fn perform_when(&mut self, safe: Option<Mark>, command: Command) -> anyhow::Result<()> {
         while self.giving_back.try_join_next().is_some() {}
         let untouched = self.follow_what_was_lost(&command)?;
         match command {
-            // Waking is the shell's: it has the clock.
+            // The shell handles wakes: it has the clock.
             Command::Note(_) | Command::End { .. } | Command::Wake { .. } => {}
             Command::Acquire { instance, requirements, priority } => {
                 self.acquires += 1;
@@ -508,14 +508,14 @@ impl Performer {
         Ok(())
     }
 
-    /// The run is over, or has failed: what has not begun does not.
+    /// The run is over, or has failed: what has not begun does not begin any more.
     pub(super) fn begin_no_more(&self) {
         self.over.cancel();
     }
 
-    /// Waits until what was decided is recorded and given back, and ends the session. What nobody has heard of by then: how far the operations of
-    /// the run are done, and whose effects failed first. An error when something that was decided is not recorded: the world pool or the resource
-    /// manager know less than what happened.
+    /// Waits until all decisions are recorded and all leases given back, and ends the session. Returns the events that the executive has not been
+    /// told by then: how far the run's operations are done, and whose effects failed first. An error if a decision is not recorded: the world pool or
+    /// the resource manager then know less than what happened.
     pub(super) async fn close(self) -> (Vec<Event>, anyhow::Result<()>) {
         let (heard, session, recorded) = (self.heard, self.number, Arc::clone(&self.recorded));
         let closed = self.end().await;
@@ -535,7 +535,7 @@ impl Performer {
             self.records.send(Record::Flush(done)).await.map_err(|_| "the recorder is gone".to_owned())?;
             recorded.await.unwrap_or_else(|_| Err("the recorder is gone".to_owned()))
         };
-        // An operation waits for the leases that go back before it, and all of them perhaps for a resource manager that is away.
+        // An operation waits for the leases that go back before it, and all of them perhaps for an absent resource manager.
         let operating = self.order.operating.all();
         let mut before = if operating.is_empty() { Vec::new() } else { self.order.returning.all() };
         before.extend(operating);
@@ -560,7 +560,7 @@ impl Performer {
         if tokio::time::timeout(CLOSE_DEADLINE, giving_back).await.is_err() {
             tracing::warn!("what was left at the end of the run was not given back in time");
         }
-        // Whoever gets the resources now changes the world; what was not recorded in time never is.
+        // Whoever gets the resources now changes the world; what was not recorded in time is never recorded.
         self.recorder.abort();
         let _ = self.recorder.await;
         self.session.close().await;
@@ -578,7 +578,7 @@ impl Performer {
         Ok(())
     }
 
-    /// Of a run that came back without what it held: under which condition a commit is made that is of what had begun before; and what begins from now
+    /// For a run that was resumed without its leases: the condition under which a commit is made whose state had begun before. What begins from now
     /// on begins with what the run holds.
     fn follow_what_was_lost(&mut self, command: &Command) -> anyhow::Result<Option<Untouched>> {
         let Some(between) = &mut self.came_between else { return Ok(None) };
@@ -605,7 +605,7 @@ impl Performer {
         self.record(Record::Operate { instance, number, operations, order })
     }
 
-    /// Where it need not be there first its goal leaves at once, if an id was promised.
+    /// If the projection need not exist first, its goal starts at once, given a promised id.
     fn project(&mut self, instance: InstanceId, asked: Projecting) -> anyhow::Result<()> {
         let behind = self.records.max_capacity() - self.records.capacity();
         let told = if asked.first { None } else { self.events.clone().try_reserve_owned().ok() };
@@ -658,13 +658,13 @@ impl Performer {
             whom: Whom { resources: self.resources.clone(), world: self.world.clone(), told: self.told.clone() },
         };
         let mut asking = Box::pin(trace::within(self.of(instance), acquiring.ask(self.events.clone())));
-        // The request leaves here and now: tasks would be run, and requests arrive, in any order.
+        // The request is sent here and now: spawned tasks, and so requests, would run in any order.
         if asking.as_mut().now_or_never().is_none() {
             tokio::spawn(asking);
         }
     }
 
-    /// Who waits for resources longest, if that is longer than somebody who watches the run takes for granted.
+    /// The instance that has waited longest for resources, if that is longer than an observer of the run expects.
     pub(super) fn waits(&self) -> Option<InstanceId> {
         let idle = self.jobs.values().all(|job| job.ended.is_finished());
         let bound = if idle { LONG_WHILE_IDLE } else { LONG };
@@ -672,13 +672,13 @@ impl Performer {
         (longest.since.elapsed() >= bound).then_some(instance)
     }
 
-    /// Says what is in the way of an instance that waits, in the resource manager's words.
+    /// Reports what is in the way of a waiting instance, in the resource manager's words.
     pub(super) fn say_why(&self, at: Timestamp, instance: InstanceId, path: String) {
         let Some(Asking { request, since, .. }) = self.asking.get(instance) else { return };
         let (resources, request, waited_s) = (self.resources.clone(), request.clone(), since.elapsed().as_secs());
         let messages = self.messages.clone();
         tokio::spawn(async move {
-            // One that has its answer by now does not wait any more.
+            // If the acquire has its answer by now, it does not wait any more.
             let waiting = match resources.explain(&request).await {
                 Ok(waiting) => waiting,
                 Err(_) => match resources.explain(&late_request(&request)).await {
@@ -693,7 +693,7 @@ impl Performer {
         });
     }
 
-    /// The event of an answer; `None` when what it answers was withdrawn or cancelled: what crossed with that goes back.
+    /// The event of an answer; `None` if the acquire or goal was withdrawn or cancelled: what it was granted meanwhile goes back.
     pub(super) fn accept(&mut self, answer: Answer, mirror: &World) -> Option<Event> {
         let (event, withdrawn) = match answer {
             Answer::Event { event, withdrawn } => (*event, withdrawn.filter(|one| one.token.is_cancelled())),
@@ -744,7 +744,7 @@ impl Performer {
                     }
                     _ => {}
                 }
-                // Also where it is the projection that could not be made, while its goal went on.
+                // The goal may also go on if its projection could not be made.
                 if let Event::Crashed { instance, attempt, .. } = &event {
                     // If the world pool was started again, it has promised nothing.
                     self.promises.forget();
@@ -780,7 +780,7 @@ impl Performer {
         };
         let (resource, over) = (source.clone(), CancellationToken::new());
         let before = if given == Given::Now { self.stopping.before(&source) } else { Vec::new() };
-        // What has no projection looks at the root, in which everything that was decided before has to be; unless nothing there is anything to it.
+        // A goal without a projection reads the root, which has to contain every earlier decision; unless the goal reads no facts.
         let looks_at_root = given != Given::ToStop && goal.projection.is_none() && !goal.reads_nothing;
         let sees = looks_at_root.then(|| (self.recorded.subscribe(), self.decided));
         let performing = Performing {
@@ -830,7 +830,7 @@ impl Performer {
         before.iter().for_each(|job| self.stopping.leave(job));
     }
 
-    /// The outputs that a result of the goal's action has to have.
+    /// The output ports that a result of the goal's action must have.
     fn outputs_of(&self, goal: &Goal) -> Vec<String> {
         let provider = self.catalogue.providers.get(&*goal.provider);
         let action = provider.and_then(|provider| provider.actions.get(&*goal.action));

@@ -1,8 +1,8 @@
-//! Coming back to a run whose task control was killed: what it had asked for is asked for again, and nothing twice.
+//! Resumes a run whose task control was killed: requests without an answer are repeated, and nothing is done twice.
 //!
-//! Leases live on with the run's session, if that still lives; what nobody knows to have goes back. Goals are looked for where
-//! they were given. Commits that the world pool does not have, and operations that the log does not say to be done, are made under their ids.
-//! Where the session has ended, `made_anew` says which operations were done.
+//! Leases live on with the run's session, if that still lives; leases that the run does not know of go back. Goals are looked for where they were
+//! given. Commits that the world pool does not have, and operations that the log does not report as done, are made under their ids. If the session
+//! has ended, `made_anew` finds out which operations were done.
 //!
 //! ```text
 //! the session that the log names is found ─► it is the run's, with all that is done in it
@@ -37,19 +37,19 @@ use std::sync::Arc;
 use std::time::Instant;
 use tokio_util::sync::CancellationToken;
 
-/// So many withdrawals of before are under way at once.
+/// Number of earlier withdrawals that are repeated at once.
 const WITHDRAWN_AT_ONCE: usize = 64;
 
-/// A revision of the root, and what the facts are there that a run believes to be otherwise.
+/// A revision of the root, and the present values of the facts about which a run is wrong.
 pub(crate) type Changed = (Revision, Vec<(FactKey, Option<Value>)>);
 
-/// What the world pool did not have of a run's commits.
+/// The commits of a run that the world pool did not have.
 struct Missing {
-    /// So many were made.
+    /// Number of those that were made.
     made: usize,
-    /// These are behind an operation that may not be done.
+    /// Those behind an operation that is perhaps not done.
     behind: Vec<Decided>,
-    /// Up to this revision nothing stands against these.
+    /// Up to this revision no change by others conflicts with them.
     seen: Revision,
 }
 
@@ -67,7 +67,7 @@ pub(crate) async fn check_world(place: &Place, ledger: &Ledger) -> anyhow::Resul
     Ok(())
 }
 
-/// Whether the world pool needs no commit that the ledger has forgotten. Where it does, the run has to be resumed from its whole log.
+/// Whether the world pool needs no commit that the ledger has forgotten. If it does, the run has to be resumed from its whole log.
 pub(crate) async fn remembers(place: &Place, ledger: &Ledger) -> anyhow::Result<bool> {
     if ledger.forgotten == 0 {
         return Ok(true);
@@ -77,7 +77,7 @@ pub(crate) async fn remembers(place: &Place, ledger: &Ledger) -> anyhow::Result<
     Ok(youngest_there(&world, ledger, root).await?.youngest.is_some())
 }
 
-/// How many of the ledger's commits the world pool lacks; `None` where it cannot be told any more.
+/// How many of the ledger's commits the world pool lacks; `None` if that cannot be told any more.
 pub(crate) async fn missing_commits(place: &Place, ledger: &Ledger) -> anyhow::Result<Option<usize>> {
     let world = WorldClient::new(&Channels::new(&place.tls), &place.endpoints.world_pool)?;
     let (root, _) = retry_unanswered(|| world.root()).await?;
@@ -90,27 +90,27 @@ pub(crate) async fn missing_commits(place: &Place, ledger: &Ledger) -> anyhow::R
     Ok(there.map(|there| ledger.commits.len() - there))
 }
 
-/// Whether commits of the run may be older than what the pool can tell of.
+/// Whether commits of the run may be older than what the pool can report.
 fn is_before(ledger: &Ledger, oldest: Revision) -> bool {
     oldest > ledger.first_revision && !ledger.commits.is_empty()
 }
 
-/// What the pool has of a run's commits.
+/// The commits of a run that the pool has.
 struct There {
-    /// How many of those in the ledger, and the pool's revision of the last of them; `None` where it tells of none.
+    /// The number of the ledger's commits that it has, and the pool's revision of the last of them; `None` if it reports none.
     youngest: Option<(usize, Revision)>,
-    /// The oldest revision that it can tell of.
+    /// The oldest revision that it can report.
     oldest_kept: Revision,
 }
 
-/// How many of the ledger's commits the pool has: they were made in order, so those up to the youngest that it tells of.
+/// How many of the ledger's commits the pool has: they were made in order, so all up to the youngest that it reports.
 async fn youngest_there(world: &WorldClient, ledger: &Ledger, root: Revision) -> Result<There, CallError> {
-    // Where many others commit, what is told of may leave the pool before it was read.
+    // If many others commit, the reported revision may leave the pool before it was read.
     retry_unanswered(|| retry_forgotten(|| youngest_told(world, ledger, root))).await
 }
 
 async fn youngest_told(world: &WorldClient, ledger: &Ledger, root: Revision) -> Result<There, CallError> {
-    // Any fact says how far back the pool can tell.
+    // The history of any fact says how far back the pool can report.
     let any = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
     let (_, oldest) = world.history(any).await?;
     let after = oldest.max(ledger.first_revision);
@@ -131,10 +131,10 @@ async fn youngest_told(world: &WorldClient, ledger: &Ledger, root: Revision) -> 
 }
 
 impl Performer {
-    /// That the run has lost what it held, where its session is not there any more: it is in the log before anything is made in another one.
+    /// The event that the run has lost its leases, if its session is gone: it is logged before anything is made in another session.
     ///
     /// # Errors
-    /// Where the world pool does not say what it has of the run.
+    /// If the world pool does not say what it has of the run.
     pub(crate) async fn session_lost(&self, ledger: &Ledger) -> anyhow::Result<Option<Event>> {
         if self.is_own {
             return Ok(None);
@@ -145,11 +145,11 @@ impl Performer {
         Ok(Some(Event::SessionLost { held_until }))
     }
 
-    /// What has changed from outside while nobody was there, with what the run had decided on top of it, be that in the world pool or not. What is due
-    /// is decided on that.
+    /// The changes from outside during the absence of task control, in the root together with all commits that the run had decided, whether or not
+    /// the world pool has them. What is due is decided on that.
     ///
     /// # Errors
-    /// Where the world pool does not say what it has of the run.
+    /// If the world pool does not say what it has of the run.
     pub(crate) async fn changed_meanwhile(&self, ledger: &Ledger, mirror: &World) -> anyhow::Result<Option<Changed>> {
         let (revision, facts) = retry_unanswered(|| self.world.root()).await?;
         let there = self.commits_there(ledger, revision).await?;
@@ -157,11 +157,11 @@ impl Performer {
         Ok(changed(revision, facts, &ledger.commits[there..], mirror))
     }
 
-    /// Takes up everything that is open, in the order in which it was decided; `now` is the time of the run. What the executive is to be told: that all
-    /// of it is so in a new session, and what has changed from outside meanwhile.
+    /// Takes up everything that is open, in the order of decision; `now` is the time of the run. Returns the events for the executive: that
+    /// everything was made again in a new session, and what has changed from outside meanwhile.
     ///
     /// # Errors
-    /// Where the run cannot go on.
+    /// If the run cannot go on.
     pub(crate) async fn take_up(
         &mut self,
         program: &Arc<Program>,
@@ -174,11 +174,11 @@ impl Performer {
         let changed = changed(revision, facts, &missing.behind, mirror);
         let changed = changed.map(|(revision, facts)| Event::WorldChanged { revision, facts });
         self.stop_again(&ledger);
-        // Before all that takes a while: whoever performs them waits for their run no longer than its grace.
+        // First, because all else takes a while: providers wait for their goals' run no longer than its grace.
         for (instance, (attempt, goal)) in std::mem::take(&mut ledger.goals) {
             self.start(instance, attempt, goal, Given::Before, None);
         }
-        // Operations wait for that.
+        // Operations wait for these withdrawals.
         let withdrawn = self.withdraw_again(std::mem::take(&mut ledger.withdrawn));
         let mut recorded = Vec::new();
         if let Some(settled) = settled {
@@ -204,11 +204,11 @@ impl Performer {
         Ok(recorded.into_iter().chain(changed).collect())
     }
 
-    /// Does what a run that has ended had decided and may not have done: its commits, and its operations. Where its session has ended these are what
-    /// takes away: what it had created is gone with that. So many of each. `now` is the time of the run.
+    /// Performs what a run that has ended had decided and perhaps not done: its commits and its operations. If its session has ended, only the
+    /// operations that take something away: what it had created is gone with the session. Returns the number of each. `now` is the time of the run.
     ///
     /// # Errors
-    /// Where the commits cannot be made.
+    /// If the commits cannot be made.
     pub(crate) async fn finish(
         &mut self,
         program: &Arc<Program>,
@@ -223,7 +223,7 @@ impl Performer {
             if removed > 0 {
                 self.make_anew(settled, &ledger).await?;
             }
-            // Nothing of it is open any more, for whoever comes next.
+            // Nothing of the run is open any more for later resumptions.
             self.recorded.send_modify(|recorded| recorded.operation = ledger.operations);
             self.go_on_recording(program, &ledger, missing)?;
             return Ok((commits, removed));
@@ -234,8 +234,8 @@ impl Performer {
         Ok((commits, self.go_on_recording(program, &ledger, missing)?))
     }
 
-    /// Makes every commit that the world pool does not have, up to the first one behind an operation that may not be done. What these were, and
-    /// the root with them.
+    /// Makes every commit that the world pool does not have, up to the first one behind an operation that is perhaps not done. Returns what these
+    /// were, and the root with them.
     async fn commit_again(
         &mut self,
         program: &Arc<Program>,
@@ -264,21 +264,21 @@ impl Performer {
         }
         let (revision, facts) = self.root().await?;
         if let Some(since) = ledger.beginnings.others_count() {
-            // What ended well meanwhile, and was not heard of, is to stand the same test.
+            // Goals that ended well meanwhile, without task control, have to pass the same test.
             let changed = self.changed_by_others(since, revision).await?;
             self.came_between = Some(CameBetween::new(program, &self.run, ledger, changed));
         }
         let commit = ledger.commits[..there + made].last().map(|decided| decided.revision).unwrap_or_default();
-        // All of it is in the root that was read.
+        // All of these commits are in the root that was read.
         self.told.committed(commit);
-        // Whoever gets what is given back waits for the rest.
+        // The next holder of what is given back waits for the other commits.
         self.decided = ledger.commits.last().map(|decided| decided.revision).unwrap_or_default();
         let operation = if self.is_own { ledger.recorded } else { 0 };
         self.confirm(Confirmed { commit, operation, failed: None });
         Ok((Missing { made, behind: missing[made..].to_vec(), seen }, revision, facts))
     }
 
-    /// What the run had given back while commits were on their way that are not there yet, and how long ago.
+    /// Notes the leases that the run had given back while commits were under way that the pool does not have yet, and how long ago.
     fn knows_what_went_back(&self, ledger: &Ledger, there: usize, now: Timestamp) {
         let made = ledger.commits[..there].last().map(|decided| decided.revision).unwrap_or_default();
         for WentBack { decided, at, .. } in &ledger.went_back {
@@ -287,8 +287,9 @@ impl Performer {
         }
     }
 
-    /// Under which condition a commit of before is made, against which nothing stands up to a revision: others have not changed the same since, where the
-    /// run has lost what it held; where it has not, they have not since it was decided, as soon as nobody waits for it any more.
+    /// The condition for an earlier commit, with which no change up to revision `seen` conflicts. If the run has lost its leases: others have not
+    /// changed the same facts since `seen`. If it has not: they have not since the decision; this is checked once nobody waits for the commit any
+    /// more.
     fn untouched(&self, program: &Arc<Program>, decided: &Decided, seen: Revision) -> Untouched {
         match decided.began.held_until {
             Some(_) => Untouched::behind(program, &self.run, seen),
@@ -296,15 +297,15 @@ impl Performer {
         }
     }
 
-    /// Tells goals to stop that may not have heard of it.
+    /// Cancels goals that may not have got their cancel.
     fn stop_again(&mut self, ledger: &Ledger) {
         for (instance, attempt, goal) in &ledger.stopped {
             self.start(*instance, *attempt, goal.clone(), Given::ToStop, None);
         }
     }
 
-    /// Does the operations that may not be done, under their ids, where the session is the run's; and the commits behind them, all in the order in
-    /// which they were decided. How many operations.
+    /// Performs the operations that are perhaps not done, under their ids, if the session is the run's own; and the commits behind them, all in the
+    /// order of decision. Returns the number of operations.
     fn go_on_recording(&mut self, program: &Arc<Program>, ledger: &Ledger, missing: Missing) -> anyhow::Result<usize> {
         let seen = missing.seen;
         let open: Vec<_> = if self.is_own { ledger.open_operations().cloned().collect() } else { Vec::new() };
@@ -323,8 +324,8 @@ impl Performer {
         Ok(operations)
     }
 
-    /// Of what was lost before it was committed, and of what nobody waits for any more: where others have changed since what that changes or is made of,
-    /// it is not true any more.
+    /// Refuses to resume if others have changed facts that a missing commit changes or is based on. Checks commits whose leases were lost before they
+    /// were made, and commits for which nobody waits any more.
     async fn refuse_what_came_between(
         &self,
         program: &Program,
@@ -360,8 +361,9 @@ impl Performer {
         }
     }
 
-    /// Undoes what was withdrawn before, if that was not heard: what crossed with the end of task control goes back; a waiting one has left the queue
-    /// with its connection. Nothing waits for that but operations, and leases that nobody knows of. What is returned is cancelled when all of it is done.
+    /// Repeats earlier withdrawals that may not have arrived: a lease whose grant crossed with the end of task control goes back; a waiting request
+    /// has left the queue with its connection. Only operations, and the return of leases that nobody knows of, wait for this. The returned token is
+    /// cancelled when all of it is done.
     fn withdraw_again(&mut self, withdrawn: Vec<String>) -> CancellationToken {
         let over = CancellationToken::new();
         let ends = over.clone().drop_guard();
@@ -380,8 +382,8 @@ impl Performer {
         over
     }
 
-    /// Gives back what the session holds and the run does not: what it was about to give back, with word of what it has committed; and, behind the
-    /// withdrawals, which give back as well what was used up, grants that nobody heard of. What others left to be told of these stays there.
+    /// Gives back the leases that the session holds and the run does not: those that it was about to give back, with a note about its commits; and,
+    /// after the withdrawals (which also return what was used up), grants that nobody heard of. Notes of earlier holders stay at the resources.
     async fn sweep(&mut self, ledger: &Ledger, withdrawn: CancellationToken) -> anyhow::Result<()> {
         let living = living_leases(&self.resources, &self.run).await?;
         let (known, unheard): (Vec<LeaseId>, BTreeSet<LeaseId>) = {
@@ -423,19 +425,18 @@ impl Performer {
     }
 }
 
-/// What is otherwise than in a mirror in a root of these facts, when these commits are made, too.
+/// The facts that differ from a mirror, in a root of these facts to which the missing commits are applied.
 fn changed(revision: Revision, facts: Vec<(FactKey, Value)>, missing: &[Decided], mirror: &World) -> Option<Changed> {
     let mut root = World::from_facts(facts, revision);
     for decided in missing {
-        // What cannot be made of what others have left there is refused when it is its turn.
+        // What cannot be applied to others' changes is refused when it is its turn.
         let _ = root.apply(&decided.changes);
     }
     let facts = outside::differences(&root, mirror);
     (!facts.is_empty()).then_some((revision, facts))
 }
 
-/// The requests of withdrawn acquires: those of the last moments may have been granted meanwhile and keep others waiting; older ones were answered
-/// long ago.
+/// The requests of withdrawn acquires, newest first: the last ones may have been granted meanwhile and keep others waiting; older ones were answered long ago.
 fn newest_first(withdrawn: Vec<String>) -> impl Iterator<Item = String> {
     withdrawn.into_iter().rev().flat_map(|request| [late_request(&request), request])
 }

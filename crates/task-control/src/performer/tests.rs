@@ -76,18 +76,18 @@ fn finished(instance: InstanceId) -> Event {
 }
 
 impl Performer {
-    /// As where everything before it is safe.
+    /// Performs a command when everything before it is safe on disk.
     fn perform(&mut self, command: Command) -> anyhow::Result<()> {
         self.perform_when(None, command)
     }
 
-    /// Ends, where nobody asks what is done.
+    /// Closes the performer; ignores the events for the executive.
     async fn closed(self) -> anyhow::Result<()> {
         self.close().await.1
     }
 }
 
-/// Which operation an event says to be done, and in which session.
+/// The operation that an event reports as done, and the session.
 fn done_of(event: Option<&Event>) -> Option<(u64, u64)> {
     match event {
         Some(Event::Recorded { operation, session, .. }) => Some((*operation, *session)),
@@ -100,7 +100,7 @@ struct Bench {
     performer: Performer,
     answers: mpsc::Receiver<Answer>,
     endpoints: Endpoints,
-    /// Whoever offers the arm.
+    /// The session that offers the arm.
     _robot: Session,
     _place: tempfile::TempDir,
     _shutdown: DropGuard,
@@ -139,7 +139,7 @@ impl Bench {
         self.performer.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })
     }
 
-    /// What the executive makes of the end of `ended`: `next`, if anybody, wants what that had.
+    /// Performs what the executive decides at the end of `ended`: `next`, if given, wants what that had.
     fn goes_on(&mut self, ended: InstanceId, lease: LeaseId, next: Option<InstanceId>) -> anyhow::Result<()> {
         let event = finished(ended);
         let asks = next.map(|instance| Command::Acquire { instance, requirements: arm(), priority: 0 });
@@ -153,7 +153,7 @@ impl Bench {
         commands.into_iter().try_for_each(|command| self.performer.perform(command))
     }
 
-    /// The next event that the executive is given, but that an operation is done.
+    /// The next event for the executive, except for operations that are done.
     async fn event(&mut self) -> Option<Event> {
         loop {
             match self.any_event().await? {
@@ -163,7 +163,7 @@ impl Bench {
         }
     }
 
-    /// The next event that the executive is given.
+    /// The next event for the executive.
     async fn any_event(&mut self) -> Option<Event> {
         loop {
             let answer = self.answers.recv().await?;
@@ -173,36 +173,36 @@ impl Bench {
         }
     }
 
-    /// Task control is killed and comes back; `lives` says whether its session still does.
+    /// Task control is killed and resumes the run; `lives` says whether its session still lives.
     async fn comes_back(self, lives: bool) -> anyhow::Result<Bench> {
         let before = self.performer.number;
         self.comes_back_to(before, lives).await
     }
 
-    /// The same, where the log says that the run's session has this number.
+    /// The same, with the number of the run's session by the log.
     async fn comes_back_to(mut self, before: u64, lives: bool) -> anyhow::Result<Bench> {
         let run = self.performer.run.clone();
         let (events, answers) = mpsc::channel(8);
         self.answers = answers;
         if lives {
-            // Nobody says farewell.
+            // The session is not closed.
             std::mem::forget(self.performer);
         } else {
-            // Its farewell is what the end of its time would be.
+            // Closing the session has the same effect as its expiry.
             self.performer.session.close().await;
         }
         self.performer = connect_as(&self.endpoints, &run, Some(before), "task", events).await?;
         Ok(self)
     }
 
-    /// Takes up what its log says, as a resumption does: that it has lost what it held is in the log before.
+    /// Takes up the log's open items, as a resumption does: the loss of its leases is logged before.
     async fn takes_up(&mut self, mut ledger: Ledger, mirror: &World) -> anyhow::Result<Vec<Event>> {
         self.loses(&mut ledger).await?;
         let now = ledger.last;
         self.performer.take_up(&fetch_boxes(), ledger, mirror, now).await
     }
 
-    /// Does what a run that has ended had decided.
+    /// Performs what a run that has ended had decided.
     async fn finishes(&mut self, mut ledger: Ledger) -> anyhow::Result<(usize, usize)> {
         self.loses(&mut ledger).await?;
         let now = ledger.last;
@@ -215,7 +215,7 @@ impl Bench {
         Ok(())
     }
 
-    /// How many units of a kind there are.
+    /// Number of existing units of a kind.
     async fn units(&self, kind: &str) -> anyhow::Result<u32> {
         let resources = self.performer.resources.list(&[kind]).await?;
         Ok(resources.iter().map(|resource| resource.capacity.units()).sum())
@@ -252,13 +252,13 @@ async fn the_next_node_takes_a_lease_over_until_others_get_their_turn() -> anyho
     let lease = bench.granted(first).await?;
     bench.goes_on(first, lease, Some(second))?;
     assert_eq!(bench.granted(second).await?, lease);
-    // Longer than a turn.
+    // Longer than `TURN`.
     tokio::time::sleep(Duration::from_millis(150)).await;
     bench.goes_on(second, lease, Some(third))?;
     let other = bench.granted(third).await?;
     assert_ne!(other, lease);
 
-    // One that is not wanted any more when it is taken over goes back.
+    // A lease that is handed to an instance whose acquire was withdrawn goes back.
     bench.goes_on(third, other, Some(fourth))?;
     bench.performer.perform(Command::Withdraw { instance: fourth })?;
     let handed = bench.answers.recv().await;
@@ -277,7 +277,7 @@ async fn one_that_waits_takes_the_lease_over_and_leaves_the_queue() -> anyhow::R
     for waits in [second, third, fourth] {
         bench.ask(waits)?;
     }
-    // All three wait at the manager before the lease is there again.
+    // All three wait at the manager before the lease is given back.
     let deadline = Instant::now() + SESSION_DEADLINE;
     let manager = bench.performer.resources.clone();
     while manager.explain("").await?.len() < 3 && Instant::now() < deadline {
@@ -286,7 +286,7 @@ async fn one_that_waits_takes_the_lease_over_and_leaves_the_queue() -> anyhow::R
     bench.goes_on(first, lease, None)?;
     assert_eq!(bench.granted(second).await?, lease);
     bench.goes_on(second, lease, None)?;
-    // What was handed over and is not wanted any more goes to the next.
+    // A handed-over lease that is not wanted any more goes to the next instance.
     bench.performer.perform(Command::Withdraw { instance: third })?;
     let handed = bench.answers.recv().await.context("no answer")?;
     assert_eq!(bench.performer.accept(handed, &World::default()), None);
@@ -309,7 +309,7 @@ async fn one_that_asks_again_in_the_step_that_gives_it_a_lease_has_it_once() -> 
     bench.ask(first)?;
     let lease = bench.granted(first).await?;
     bench.ask(second)?;
-    // What the first one decided makes the second one certain: it asks anew.
+    // A decision of the first instance makes the second one certain: it asks anew.
     let commands = vec![
         Command::Withdraw { instance: second },
         Command::Acquire { instance: second, requirements: arm(), priority: CERTAIN },
@@ -317,7 +317,7 @@ async fn one_that_asks_again_in_the_step_that_gives_it_a_lease_has_it_once() -> 
     ];
     bench.steps(&finished(first), commands)?;
     assert_eq!(bench.granted(second).await?, lease);
-    // Nothing is given back behind its back.
+    // No further lease is granted or given back.
     let more = tokio::time::timeout(Duration::from_millis(100), bench.event()).await;
     assert!(more.is_err(), "{more:?}");
     let held = bench.performer.resources.list(&["Arm"]).await?;
@@ -333,7 +333,7 @@ async fn a_run_hears_of_who_waits_beside_it_for_what_it_holds_and_needs_that_for
     bench.granted(holder).await?;
     let (events, _answers) = mpsc::channel(8);
     let mut other = connect(&bench.endpoints, "other", events).await?;
-    // What may be in vain has time.
+    // A speculative acquire does not make others give way.
     other.perform(Command::Acquire { instance: waiter, requirements: arm(), priority: 7 })?;
     let quiet = tokio::time::timeout(Duration::from_secs(2), bench.event()).await;
     assert!(quiet.is_err(), "{quiet:?}");
@@ -344,7 +344,7 @@ async fn a_run_hears_of_who_waits_beside_it_for_what_it_holds_and_needs_that_for
     bench.performer.closed().await
 }
 
-/// A bench whose resource manager can be away: it is at a place of its own.
+/// A bench whose resource manager can be absent: it has a place of its own.
 async fn with_manager_at(directory: &RuntimeDirectory) -> anyhow::Result<(Bench, Session)> {
     let mut bench = Bench::new().await?;
     let channels = Channels::new(&ClientTls::none());
@@ -373,7 +373,7 @@ async fn a_lease_that_goes_back_while_the_manager_is_away_for_long_is_back_when_
     shutdown.cancel();
     ended.await;
     bench.performer.perform(Command::Release { instance: first, lease: Some(lease), projection: None })?;
-    // For longer than 16 tries, and for less than a run waits for it.
+    // Longer than 16 tries, and shorter than a run waits for the manager.
     tokio::time::sleep(Duration::from_millis(5_500)).await;
     let (_again, _ended) = manager_at(&directory);
     bench.ask(second)?;
@@ -422,7 +422,7 @@ async fn the_last_operation_of_a_run_waits_for_a_manager_that_is_away_and_the_wo
         }
         assert!(WaitsFor::ResourceManager.to_string().starts_with("the resource manager"));
         let back = async {
-            // For longer than the end of a run waits for what is asked of others.
+            // Longer than `CLOSE_DEADLINE`, the limit for everything but operations.
             tokio::time::sleep(CLOSE_DEADLINE + Duration::from_millis(1_500)).await;
             comes_back.then(|| manager_at(&directory))
         };
@@ -472,7 +472,7 @@ async fn a_commit_that_is_not_answered_is_not_made_when_the_session_is_gone() ->
     std::mem::replace(&mut bench.performer, performer).closed().await?;
     bench.answers = answers;
     bench.performer.root().await?;
-    // It is sent while the session lives, and the pool is away.
+    // The commit is sent while the session lives and the pool is absent.
     shutdown.cancel();
     drop(ended.await);
     bench.performer.perform(Command::Commit {
@@ -483,20 +483,20 @@ async fn a_commit_that_is_not_answered_is_not_made_when_the_session_is_gone() ->
         revision: Revision(1),
     })?;
     tokio::time::sleep(Duration::from_millis(300)).await;
-    // Its session ends at the manager, which makes it anew: all leases are gone.
+    // The session ends at the manager, under whose id it is opened anew: all leases are gone.
     let channels = Channels::new(&ClientTls::none());
     let manager = &bench.endpoints.resource_manager;
     let same = Session::open_as(&channels, manager, bench.performer.run.clone(), "the end", DEFAULT_TTL);
     same.alive(SESSION_DEADLINE).await?;
     same.close().await;
     bench.performer.lost().await;
-    // Whoever has the resources by now commits the same fact; the pool is back for both.
+    // The present holder of the resources commits the same fact; both can reach the pool again.
     let (_again, _ended) = pool();
     let world = WorldClient::new(&channels, &bench.endpoints.world_pool)?;
     let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
     let changes = vec![Change::Set { fact, value: Value::Bool(false) }];
     retry_unanswered(|| world.commit("other/i1/1", changes.clone(), None)).await?;
-    // Of what the others did it may hear before, with what it has decided itself on top.
+    // The run may hear of the other commit before, with its own decisions on top.
     let failed = async {
         loop {
             match bench.event().await {
@@ -574,7 +574,7 @@ async fn what_may_not_be_needed_is_not_refused_for_how_long_it_waits() -> anyhow
         tokio::task::yield_now().await;
     }
     hurried(&bench.performer, third, false);
-    // It has asked later, with as much time.
+    // It has asked later, with the same time limit.
     let refused = bench.event().await;
     assert!(matches!(refused, Some(Event::Refused { instance, .. }) if instance == third), "{refused:?}");
     bench.performer.perform(Command::Release { instance: first, lease: Some(lease), projection: None })?;
@@ -591,7 +591,7 @@ async fn what_is_handed_to_one_that_is_withdrawn_before_it_has_asked_goes_back()
     let (disk, slow) = Mark::not_yet();
     let operate = Command::Operate { instance: first, operations: vec![create("Box", 1)] };
     bench.performer.perform_when(Some(slow), operate)?;
-    // It waits for the operation. That ends, and before it hears of that it is handed a lease and withdrawn.
+    // The acquire waits for the operation. When that is done, and before the acquire notices, it is handed a lease and withdrawn.
     bench.ask(second)?;
     tokio::task::yield_now().await;
     bench.performer.order.operating.all().iter().for_each(CancellationToken::cancel);
@@ -614,7 +614,7 @@ async fn a_grant_that_crosses_its_withdrawal_is_back_before_what_it_held_is_dele
     while bench.answers.len() < 2 {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
-    // Its grant is on its way, behind the word that the token is there. A race is decided: what is around it is left, and deletes.
+    // Its grant is under way, behind the news that the token exists. A race is decided: the state around it is left and deletes the token.
     bench.performer.perform(Command::Withdraw { instance: second })?;
     let delete = Requirement::new(ResourceOperation::Delete, "Token");
     bench.performer.perform(Command::Operate { instance: first, operations: vec![delete] })?;
@@ -632,7 +632,7 @@ async fn who_comes_back_leaves_word_with_what_the_run_was_about_to_give_back() -
     bench.ask(first)?;
     let Some(Event::Granted { lease, .. }) = bench.event().await else { bail!("no grant") };
     let run = bench.performer.run.clone();
-    // Killed when the log has all of it, and before any of it has left.
+    // Task control is killed when all of it is logged and nothing of it has been sent.
     let mut ledger = ledger(&run, &[]);
     ledger.command(&Command::Acquire { instance: first, requirements: arm(), priority: 0 });
     ledger.event(Timestamp(0), &Event::Granted { instance: first, lease: lease.clone() });
@@ -644,7 +644,7 @@ async fn who_comes_back_leaves_word_with_what_the_run_was_about_to_give_back() -
         revision: Revision(1),
     });
     ledger.command(&Command::Release { instance: first, lease: Some(lease.id), projection: None });
-    // It had withdrawn more than can be undone in a moment.
+    // The run had withdrawn more requests than can be repeated in a moment.
     ledger.withdrawn = (0..1_000).map(|number| format!("{run}/{late}/{number}")).collect();
     let mut bench = bench.comes_back(true).await?;
     let mut mirror = World::default();
@@ -661,7 +661,7 @@ async fn who_comes_back_leaves_word_with_what_the_run_was_about_to_give_back() -
     bench.performer.closed().await
 }
 
-/// A resource manager that a token ends, at the same place as the one before it.
+/// A resource manager that a token ends, at the same place as its predecessor.
 fn manager_at(directory: &RuntimeDirectory) -> (CancellationToken, impl Future<Output = ()> + use<>) {
     let shutdown = CancellationToken::new();
     let running = resource_manager::run(ResourceManagerConfig::default(), directory.clone(), shutdown.clone());
@@ -690,7 +690,7 @@ async fn who_waits_beside_others_while_the_manager_is_started_again_is_served_an
     let mut second = connect(&bench.endpoints, "second", events).await?;
     assert!(second.told.has_others());
     second.perform(Command::Acquire { instance: InstanceId(1), requirements: arm(), priority: CERTAIN })?;
-    // It is away when the node has waited long enough to come next.
+    // The manager is absent when the node has waited long enough to come next.
     tokio::time::sleep(LONG_BESIDE_OTHERS / 2).await;
     shutdown.cancel();
     ended.await;
@@ -723,7 +723,7 @@ async fn a_run_goes_beside_others_and_one_that_goes_alone_does_not() -> anyhow::
     third.closed().await
 }
 
-/// The next grant, and what was told of the world last before it.
+/// The next grant, and the last change of the world that was reported before it.
 async fn granted_after(
     performer: &mut Performer,
     answers: &mut mpsc::Receiver<Answer>,
@@ -765,14 +765,14 @@ async fn who_gets_what_another_run_had_has_been_told_what_that_had_committed() -
         assert_eq!(told, Some((fact.clone(), Some(value))));
         second.perform(Command::Release { instance: other, lease: Some(lease), projection: None })?;
     }
-    // Nor does one that begins only now wait for what was there before.
+    // A run that begins only now does not wait for the earlier commit either.
     let (events, mut answers) = mpsc::channel(16);
     let mut third = connect(&bench.endpoints, "third", events).await?;
     third.root().await?;
     third.perform(Command::Acquire { instance: InstanceId(1), requirements: arm(), priority: 0 })?;
     granted_after(&mut third, &mut answers).await?;
     third.closed().await?;
-    // Nobody waited in vain.
+    // No wait ran into its limit.
     assert!(began.elapsed() < Duration::from_secs(2), "{:?}", began.elapsed());
     second.closed().await?;
     bench.performer.closed().await
@@ -793,7 +793,7 @@ async fn what_is_asked_for_behind_a_deletion_does_not_get_what_is_deleted() -> a
     let acquire = |instance, kind| Command::Acquire { instance, requirements: block(kind), priority: 0 };
     bench.performer.perform(acquire(first, "Token"))?;
     let lease = bench.granted(first).await?;
-    // It is given back, deleted, and asked for: the commands of one step. The disk has time.
+    // The commands of one step: release, delete, acquire. The disk is slow.
     let (disk, slow) = Mark::not_yet();
     bench.performer.perform(Command::Release { instance: first, lease: Some(lease), projection: None })?;
     bench.performer.perform_when(Some(slow), operate(delete))?;
@@ -802,7 +802,7 @@ async fn what_is_asked_for_behind_a_deletion_does_not_get_what_is_deleted() -> a
     let early = tokio::time::timeout(Duration::from_millis(200), bench.event()).await;
     assert!(early.is_err(), "{early:?}");
     drop(disk);
-    // The disk is gone: that is heard first.
+    // The disk is gone: the failure comes first.
     let failed = bench.event().await;
     assert!(matches!(&failed, Some(Event::RetirementFailed { .. })), "{failed:?}");
     bench.performer.closed().await.expect_err("what was deleted is there");
@@ -816,7 +816,7 @@ async fn a_lease_is_back_before_what_it_held_is_used_up() -> anyhow::Result<()> 
     let operate = |operation: Requirement| Command::Operate { instance: first, operations: vec![operation] };
     let consume = Requirement::new(ResourceOperation::Consume, "Token");
     for _ in 0..20 {
-        // The only one, so that it is used up by nothing but what was given back.
+        // The only token, so that only what was given back can be used up.
         bench.performer.perform(operate(create("Token", 1)))?;
         let all = Requirement { count: 1.into(), ..Requirement::new(ResourceOperation::Block, "Token") };
         bench.performer.perform(Command::Acquire { instance: second, requirements: vec![all], priority: 0 })?;
@@ -824,7 +824,7 @@ async fn a_lease_is_back_before_what_it_held_is_used_up() -> anyhow::Result<()> 
         bench.performer.perform(Command::Release { instance: second, lease: Some(lease), projection: None })?;
         bench.performer.perform(operate(consume.clone()))?;
     }
-    // None is left: whoever asks behind it waits.
+    // No token is left: an acquire behind the consume waits.
     let exists = vec![Requirement::new(ResourceOperation::Exists, "Token")];
     bench.performer.perform(Command::Acquire { instance: first, requirements: exists, priority: 0 })?;
     let early = tokio::time::timeout(Duration::from_millis(300), bench.event()).await;
@@ -844,7 +844,7 @@ async fn who_comes_back_tells_a_goal_to_stop_that_may_not_have_been_told() -> an
     while arm.running() == 0 {
         tokio::task::yield_now().await;
     }
-    // Task control is killed when it has written that down, and before it has told the arm.
+    // Task control is killed when it has logged the cancel and before it has sent it to the arm.
     let run = bench.performer.run.clone();
     let acquire = Command::Acquire { instance: routine, requirements: self::arm(), priority: 0 };
     let mut ledger = ledger(&run, &[]);
@@ -860,7 +860,7 @@ async fn who_comes_back_tells_a_goal_to_stop_that_may_not_have_been_told() -> an
     let mut bench = bench.comes_back(true).await?;
     bench.performer.catalogue = catalogue;
     bench.takes_up(ledger, &World::default()).await?;
-    // The next goal of that arm leaves when it stands still.
+    // The next goal of that arm is sent when the arm stands still.
     bench.performer.perform(start(InstanceId(3), 1, "work", lease, &endpoint))?;
     let event = bench.event().await;
     assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == SUCCESS), "{event:?}");
@@ -881,7 +881,7 @@ async fn what_was_left_is_told_to_the_next_holder_when_the_last_one_gave_up_befo
     let (first, instance) = (InstanceId(1), InstanceId(2));
     bench.ask(first)?;
     let (lease, _) = granted_after(&mut bench.performer, &mut bench.answers).await?;
-    // What it has committed is on its way for long.
+    // Its commit is under way for long.
     bench.performer.resources.release_with_note(lease, "0 12".to_owned()).await?;
     second.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })?;
     let holds = async |performer: &Performer| {
@@ -948,7 +948,7 @@ async fn a_run_that_asks_again_and_again_with_the_highest_priority_lets_another_
     let waiting = granted_after(&mut second, &mut answers);
     tokio::pin!(waiting);
     let (began, mut turns) = (Instant::now(), 1);
-    // It asks for its next turn before it gives this one back.
+    // It asks for its next turn before it gives this lease back.
     while tokio::time::timeout(Duration::from_millis(50), &mut waiting).await.is_err() {
         assert!(began.elapsed() < 5 * LONG_BESIDE_OTHERS, "it is never let pass");
         ask(&mut bench.performer, turns + 1, i64::MAX)?;
@@ -970,7 +970,7 @@ async fn a_run_that_asks_again_and_again_with_the_highest_priority_lets_another_
 #[tokio::test]
 async fn a_run_whose_effects_are_not_all_recorded_does_not_end_well() -> anyhow::Result<()> {
     let mut bench = Bench::new().await?;
-    // Nothing can be added to it.
+    // The increase of this fact must fail.
     let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
     let mut changes = done();
     changes.push(Change::Increase { fact, by: 1.0 });
@@ -1012,7 +1012,7 @@ async fn a_projection_that_crosses_its_cancel_goes_back() -> anyhow::Result<()> 
     bench.performer.closed().await
 }
 
-/// A projection of everything, at no lease.
+/// A projection of all facts, without a lease.
 fn projection(instance: InstanceId, attempt: u32, first: bool) -> Command {
     Command::Project {
         instance,
@@ -1030,7 +1030,7 @@ fn projection(instance: InstanceId, attempt: u32, first: bool) -> Command {
 async fn a_projection_is_named_before_it_is_there_and_shows_the_commit_on_its_way() -> anyhow::Result<()> {
     let mut bench = Bench::new().await?;
     let instance = InstanceId(1);
-    // The first is waited for; with its answer others are promised.
+    // The first projection is waited for; its answer promises further ids.
     bench.performer.perform(projection(instance, 1, false))?;
     let Some(Event::Projected { projection: first, .. }) = bench.event().await else { bail!("no projection") };
     bench.performer.perform(Command::Commit {
@@ -1041,7 +1041,7 @@ async fn a_projection_is_named_before_it_is_there_and_shows_the_commit_on_its_wa
         revision: Revision(1),
     })?;
     bench.performer.perform(projection(instance, 2, false))?;
-    // Nobody else has run since: the world pool was not heard.
+    // No other task has run since: the world pool was not asked.
     let Ok(answer) = bench.answers.try_recv() else { bail!("it waits for the world pool") };
     let named = bench.performer.accept(answer, &World::default());
     let Some(Event::Projected { attempt: 2, projection: named, .. }) = named else { bail!("{named:?}") };
@@ -1049,7 +1049,7 @@ async fn a_projection_is_named_before_it_is_there_and_shows_the_commit_on_its_wa
     let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
     assert_eq!(world.query(Some(named), &[]).await?.len(), 1, "it shows the commit, and is waited for");
     bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
-    // What acts begins when its projection is there.
+    // A goal that changes the environment begins when its projection exists.
     bench.performer.perform(projection(instance, 3, true))?;
     assert!(bench.answers.try_recv().is_err());
     assert!(matches!(bench.event().await, Some(Event::Projected { attempt: 3, .. })));
@@ -1066,7 +1066,7 @@ async fn a_projection_that_was_named_and_not_asked_for_before_the_kill_is_asked_
     let instance = InstanceId(1);
     bench.performer.perform(projection(instance, 1, false))?;
     assert!(matches!(bench.event().await, Some(Event::Projected { .. })));
-    // It has an id for the next one, and is killed when it has written that down.
+    // The next projection has an id; task control is killed when it has logged that.
     let named = bench.performer.promises.take(0, Instant::now()).context("nothing is promised")?;
     let mut ledger = ledger(&bench.performer.run, &[projection(instance, 2, false)]);
     ledger.event(Timestamp(0), &Event::Projected { instance, attempt: 2, projection: named });
@@ -1098,7 +1098,7 @@ async fn of_a_named_projection_that_cannot_be_made_is_heard_afterwards() -> anyh
     let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
     let refused = world.query(Some(named), &[]).await;
     assert_eq!(refused.map_err(|error| error.reason().to_owned()).err().as_deref(), Some("PROJECTION_UNKNOWN"));
-    // What is given back is not waited for in vain.
+    // The release of a projection that was not made must not hang.
     bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
     bench.performer.closed().await
 }
@@ -1127,7 +1127,7 @@ fn done() -> Vec<Change> {
     vec![Change::Set { fact, value: Value::Bool(true) }]
 }
 
-/// What a run had commanded before it was killed, as its log has it.
+/// The ledger of a run with these commands, before it was killed.
 fn ledger(run: &str, commands: &[Command]) -> Ledger {
     let mut ledger = Ledger { origin: Origin { run: run.to_owned(), ..Origin::default() }, ..Ledger::default() };
     commands.iter().for_each(|command| ledger.command(command));
@@ -1135,12 +1135,12 @@ fn ledger(run: &str, commands: &[Command]) -> Ledger {
     ledger
 }
 
-/// As the log has it.
+/// The program of the log.
 fn fetch_boxes() -> Arc<ratn_model::program::Program> {
     Arc::new(program(FETCH_BOXES))
 }
 
-/// What is told of the world.
+/// Only the changes of the world among these events.
 fn of_the_world(told: Vec<Event>) -> Vec<Event> {
     told.into_iter().filter(|event| matches!(event, Event::WorldChanged { .. })).collect()
 }
@@ -1159,7 +1159,7 @@ async fn who_comes_back_to_a_living_session_does_nothing_twice() -> anyhow::Resu
     };
     bench.performer.perform(commit.clone())?;
     bench.performer.perform(operate.clone())?;
-    // A grant that was on its way when task control was killed.
+    // A grant that was under way when task control was killed.
     bench.ask(InstanceId(2))?;
     bench.granted(InstanceId(2)).await?;
     let waiting = Command::Acquire { instance: InstanceId(2), requirements: arm(), priority: 0 };
@@ -1169,7 +1169,7 @@ async fn who_comes_back_to_a_living_session_does_nothing_twice() -> anyhow::Resu
     mirror.apply(&done())?;
     let ledger = ledger(&run, &[commit, operate, waiting]);
     bench.takes_up(ledger, &mirror).await?;
-    // It is asked for anew, and what nobody knew to have is free for it.
+    // The acquire is repeated, and a lease that nobody knew of is given back for it.
     bench.granted(InstanceId(2)).await?;
     assert_eq!(bench.units("Box").await?, 2);
     bench.performer.closed().await
@@ -1199,7 +1199,7 @@ async fn what_the_log_says_to_be_done_is_not_done_again_although_the_manager_has
         assert_eq!(done_of(done.as_ref()), Some((number, session)));
         done.iter().for_each(|done| ledger.event(Timestamp(0), done));
     }
-    // It is killed before the third one.
+    // Task control is killed before the third operation.
     let mut bench = bench.comes_back(true).await?;
     assert_eq!(bench.takes_up(ledger, &World::default()).await?, []);
     assert_eq!(done_of(bench.any_event().await.as_ref()), Some((3, session)));
@@ -1218,7 +1218,7 @@ async fn a_session_in_which_a_resumption_died_is_not_the_runs() -> anyhow::Resul
     assert_eq!(done_of(Some(&done)), Some((1, session)));
     let mut ledger = Ledger { session, ..ledger(&run, &[created]) };
     ledger.event(Timestamp(0), &done);
-    // Its session ends. One that comes back opens another, and is killed when it has made half of it again.
+    // The session ends. A resumption opens another one, and is killed when it has made half of the resources again.
     let bench = bench.comes_back(false).await?;
     let second = bench.performer.number;
     assert!(!bench.performer.is_own && second != session);
@@ -1234,7 +1234,7 @@ async fn a_session_in_which_a_resumption_died_is_not_the_runs() -> anyhow::Resul
     let told = bench.takes_up(ledger.clone(), &World::default()).await?;
     assert_eq!(told.iter().map(|event| done_of(Some(event))).collect::<Vec<_>>(), [Some((1, third))]);
     assert_eq!(bench.units("Box").await?, 2);
-    // From then on it is the run's.
+    // From then on the new session is the run's.
     ledger.event(Timestamp(0), &told[0]);
     assert_eq!((ledger.session, ledger.open_operations().count()), (third, 0));
     let mut bench = bench.comes_back(true).await?;
@@ -1277,7 +1277,7 @@ async fn what_was_used_up_for_good_is_not_used_up_again_with_a_new_session() -> 
     bench.performer.closed().await
 }
 
-/// Which of two kinds is below the other.
+/// A hierarchy of two kinds.
 fn glue_is_an_adhesive() -> ResourceManagerConfig {
     let kinds = BTreeMap::from([("Glue".to_owned(), vec!["Adhesive".to_owned()])]);
     ResourceManagerConfig { kinds, ..ResourceManagerConfig::default() }
@@ -1299,21 +1299,21 @@ impl Operating {
         Ok(Operating { bench, operator, ledger })
     }
 
-    /// An operator's.
+    /// An operator creates a resource.
     async fn there_is(&self, id: &str, kind: &str, capacity: u32) -> anyhow::Result<()> {
         let resource = Resource::new(id, ResourceClass::System, kind).with_capacity(capacity);
         self.operator.create(resource.non_renewable()).await?;
         Ok(())
     }
 
-    /// Is done, and the run's log says so.
+    /// The operation is done, and the run's log says so.
     async fn does(&mut self, operation: Requirement) -> anyhow::Result<()> {
         let done = self.does_unheard(operation).await?;
         self.ledger.event(Timestamp(0), &done);
         Ok(())
     }
 
-    /// Is done, and the run is killed before it has heard of that.
+    /// The operation is done, and the run is killed before it has heard of it.
     async fn does_unheard(&mut self, operation: Requirement) -> anyhow::Result<Event> {
         self.decides(operation.clone());
         self.bench.performer.perform(operate(1, operation))?;
@@ -1322,12 +1322,12 @@ impl Operating {
         Ok(done)
     }
 
-    /// The run is killed before it has asked for it.
+    /// The run is killed before it has requested the operation.
     fn decides(&mut self, operation: Requirement) {
         self.ledger.command(&operate(1, operation));
     }
 
-    /// Its session has ended when it comes back; what it tells its log.
+    /// Resumes the run after its session has ended; returns the events for the log.
     async fn comes_back(&mut self) -> anyhow::Result<Vec<Event>> {
         let before = self.ledger.session;
         let run = self.bench.performer.run.clone();
@@ -1339,7 +1339,7 @@ impl Operating {
         self.bench.takes_up(self.ledger.clone(), &World::default()).await
     }
 
-    /// What is free of each resource of a kind; `own` is what the run has created.
+    /// The free units of each resource of a kind; `own` is a resource that the run has created.
     async fn free(&self, kind: &str) -> anyhow::Result<Vec<(String, u32)>> {
         let run = &self.bench.performer.run;
         let there = self.operator.list(&[kind]).await?.into_iter();
@@ -1447,7 +1447,7 @@ async fn what_was_used_up_for_good_of_a_kind_below_is_not_used_up_twice() -> any
 #[tokio::test]
 async fn what_a_run_used_up_that_came_back_is_used_up_of_the_same_resources_when_it_comes_back() -> anyhow::Result<()> {
     let mut run = Operating::new(ResourceManagerConfig::default()).await?;
-    // The manager gives the first of those that are alike.
+    // The manager gives the first of equal resources.
     for (id, renewable) in [("b", true), ("c", false)] {
         let resource = Resource::new(id, ResourceClass::System, "Power").with_capacity(3);
         run.operator.create(if renewable { resource } else { resource.non_renewable() }).await?;
@@ -1493,7 +1493,7 @@ async fn what_a_grant_had_used_up_that_nobody_heard_of_comes_back() -> anyhow::R
     while bench.answers.is_empty() {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
-    // It is killed before it hears of the grant, and had withdrawn many others before.
+    // Task control is killed before it hears of the grant, and had withdrawn many other requests before.
     let mut ledger = ledger(&run, &[acquire]);
     ledger.withdrawn.splice(0..0, (0..2_000).map(|number| format!("{run}/i9/{number}")));
     let mut bench = bench.comes_back(true).await?;
@@ -1511,7 +1511,7 @@ async fn what_a_run_knew_when_it_decided_does_not_stand_against_it_when_it_comes
     let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
     let by_others = |value: i64| vec![Change::Set { fact: fact.clone(), value: Value::Int(value) }];
     bench.performer.world.commit("other/i1/1", by_others(1), None).await?;
-    // It hears of that, and decides; and is killed before that is committed. Its session ends.
+    // The run hears of this change, and decides a commit; it is killed before that is made, and its session ends.
     let heard = Event::WorldChanged { revision: Revision(1), facts: vec![(fact.clone(), Some(Value::Int(1)))] };
     let decides = |number: u64| Command::Commit {
         instance: InstanceId(number),
@@ -1528,7 +1528,7 @@ async fn what_a_run_knew_when_it_decided_does_not_stand_against_it_when_it_comes
     let mut bench = bench.comes_back(false).await?;
     bench.takes_up(ledger.clone(), &mirror).await?;
     assert_eq!(bench.performer.root().await?.0, Revision(2));
-    // What others make of it from now on it has not heard of when it decides again.
+    // When it decides again, it has not heard of later changes by others.
     ledger.command(&decides(3));
     bench.performer.world.commit("other/i1/2", by_others(2), None).await?;
     let mut bench = bench.comes_back(false).await?;
@@ -1544,8 +1544,8 @@ async fn what_a_run_heard_of_during_a_motion_stands_against_its_commit_when_it_c
     let bench = Bench::new().await?;
     let (run, instance) = (bench.performer.run.clone(), InstanceId(1));
     let mut ledger = ledger(&run, &[start(instance, 1, "work", LeaseId(1), "")]);
-    // It is suspended during its motion, and its session ends: whoever gets the arm changes the same. It goes on, hears of that before it hears of
-    // its session, and decides.
+    // The run is suspended during its motion, and its session ends: the next holder of the arm changes the same fact. The run goes on, hears of that
+    // change before it hears of its session, and decides.
     let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
     let changes = vec![Change::Set { fact: fact.clone(), value: Value::Bool(false) }];
     bench.performer.world.commit("other/i1/1", changes, None).await?;
@@ -1570,7 +1570,7 @@ async fn what_ended_well_while_the_session_was_lost_is_refused_where_others_have
     let bench = Bench::new().await?;
     let run = bench.performer.run.clone();
     let [motion, other] = [1, 2].map(InstanceId);
-    // It is killed during two motions, and its session ends. Others change what the first one changes.
+    // The run is killed during two motions, and its session ends. Others change what the first motion changes.
     let mut ledger = ledger(&run, &[start(motion, 1, "work", LeaseId(1), ""), start(other, 1, "work", LeaseId(1), "")]);
     ledger.event(Timestamp(0), &finished(other));
     let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
@@ -1578,7 +1578,7 @@ async fn what_ended_well_while_the_session_was_lost_is_refused_where_others_have
     bench.performer.world.commit("other/i1/1", changes, None).await?;
     let mut bench = bench.comes_back(false).await?;
     bench.takes_up(ledger, &World::default()).await?;
-    // Both have ended well; what begins now knows of it.
+    // Both motions have ended well; what begins now knows the change.
     let refused = bench.performer.perform(commits(1, 2));
     assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
     bench.performer.perform(Command::Note(Note::Retired { instance: motion }))?;
@@ -1608,7 +1608,7 @@ async fn what_others_change_when_a_run_has_come_back_stands_against_what_it_bega
     bench.performer.closed().await
 }
 
-/// What a composite state changes when it is left, as HSM mode commits it.
+/// The commit of a composite state at its exit, as HSM mode makes it.
 fn leaves(path: &str, number: u64) -> Command {
     let (instance, evidence, revision) = (InstanceId(0), Vec::new(), Revision(number));
     Command::Commit { instance, writer: path.to_owned(), changes: done(), evidence, revision }
@@ -1631,7 +1631,7 @@ async fn what_others_change_stands_against_the_effects_of_a_composite_state_whos
         start(InstanceId(3), 1, "work", LeaseId(1), ""),
     ];
     let (part, routine) = (leaves("part", 2), leaves("routine", 2));
-    // The run had decided before it was killed, or decides when it has been taken up; a part may begin anew in between.
+    // The run had decided before it was killed, or decides after the resumption; a part may begin anew in between.
     for (by_another, again, left, is_made) in [
         ("other", None, None, true),
         ("done", None, None, false),
@@ -1651,7 +1651,7 @@ async fn what_others_change_stands_against_the_effects_of_a_composite_state_whos
         ledger.event(Timestamp(0), &started(origin));
         begun.iter().for_each(|command| ledger.command(command));
         bench.performer.world.commit("other/i1/1", by_others(by_another), None).await?;
-        // It hears of that during its motion.
+        // The run hears of that change during its motion.
         let heard = Event::WorldChanged { revision: Revision(1), facts: Vec::new() };
         ledger.event(Timestamp(0), &heard);
         if left.is_none() {
@@ -1693,8 +1693,8 @@ fn started(origin: Box<Origin>) -> Event {
     }
 }
 
-/// A run that was killed during two motions and has lost its session; others have changed what the first motion changes. It was taken up once, and
-/// has committed since what the second one led to. Its log, and the number of the session that it has now.
+/// A run that was killed during two motions and has lost its session; others have changed what the first motion changes. It was resumed once, and has
+/// committed since then what follows the second motion. Returns its log, and the number of its present session.
 async fn taken_up_once() -> anyhow::Result<(Bench, Ledger, u64)> {
     let bench = Bench::new().await?;
     let run = bench.performer.run.clone();
@@ -1734,7 +1734,7 @@ fn is_refused<T>(done: anyhow::Result<T>) -> bool {
 #[tokio::test]
 async fn what_others_changed_stands_against_a_commit_however_often_its_run_is_taken_up_since() -> anyhow::Result<()> {
     for lives in [true, false] {
-        // Its resumption was refused for that: the log has the commit.
+        // The log has the commit, although a resumption was refused for it.
         let (bench, mut ledger, number) = taken_up_once().await?;
         ledger.command(&commits(1, 3));
         let mut bench = bench.comes_back_to(number, lives).await?;
@@ -1742,7 +1742,7 @@ async fn what_others_changed_stands_against_a_commit_however_often_its_run_is_ta
         assert!(is_refused(bench.takes_up(ledger.clone(), &World::default()).await), "lives: {lives}");
         assert!(is_refused(bench.finishes(ledger).await), "lives: {lives}");
         assert_eq!(bench.performer.root().await?.0, Revision(2));
-        // It was killed once more, during the motion.
+        // The run was killed once more, during the motion.
         let (bench, ledger, number) = taken_up_once().await?;
         let mut bench = bench.comes_back_to(number, lives).await?;
         bench.takes_up(ledger, &World::default()).await?;
@@ -1764,7 +1764,7 @@ async fn what_others_change_while_a_commit_waits_for_the_disk_stands_against_it_
         let ledger = ledger(&bench.performer.run, &[start(InstanceId(1), 1, "work", LeaseId(1), "")]);
         let mut bench = bench.comes_back(false).await?;
         bench.takes_up(ledger, &World::default()).await?;
-        // What the run makes itself does not stand against it.
+        // The run's own changes do not conflict with its commit.
         bench.performer.perform(commits(9, 1))?;
         let (disk, slow) = Mark::not_yet();
         bench.performer.perform_when(Some(slow), commits(1, 2))?;
@@ -1817,8 +1817,8 @@ async fn a_commit_that_others_do_not_wait_for_any_more_is_made_where_they_have_n
     Ok(())
 }
 
-/// A run that has heard of what others had made up to then, has decided a commit, and has given back behind it what that was made with; so long
-/// later others have changed a fact. It is killed, and its session lives.
+/// A run that has heard of the changes by others so far, has decided a commit, and has given back its lease behind it; after `passed`, others have
+/// changed a fact. It is killed, and its session lives.
 async fn gave_back_and_was_killed(
     behind: &[Command],
     passed: Duration,
@@ -1851,7 +1851,7 @@ async fn gave_back_and_was_killed(
     Ok((bench, ledger))
 }
 
-/// What is held of the arm.
+/// The leases that hold the arm.
 async fn living(bench: &Bench) -> anyhow::Result<Vec<LeaseId>> {
     let arms = bench.performer.resources.list(&["Arm"]).await?;
     Ok(arms.iter().flat_map(|arm| &arm.holdings).map(|holding| holding.lease).collect())
@@ -1881,7 +1881,7 @@ async fn a_commit_that_was_on_its_way_for_long_is_made_by_who_comes_back_where_o
 #[tokio::test]
 async fn what_was_not_late_when_its_run_was_taken_up_is_refused_where_it_is_when_its_turn_comes() -> anyhow::Result<()>
 {
-    // It is behind an operation.
+    // The commit is behind an operation.
     let before = [operate(9, create("Box", 1))];
     for (goes_late, is_made) in [(false, true), (true, false)] {
         let (mut bench, ledger) = gave_back_and_was_killed(&before, Duration::ZERO, "done").await?;
@@ -1955,7 +1955,7 @@ async fn who_comes_back_commits_behind_an_operation_when_that_is_done_and_never_
         let decided = [commits(1, 1), operate(1, operation), commits(2, 2)];
         let ledger = Ledger { session, ..ledger(&run, &decided) };
         let mut bench = bench.comes_back(true).await?;
-        // Its mirror has all of it.
+        // Its mirror has all of these changes.
         assert_eq!(bench.takes_up(ledger, &mirror).await?, []);
         if there == 1 {
             let failed = bench.event().await;
@@ -1976,7 +1976,7 @@ async fn behind_what_had_failed_nothing_is_made_by_who_comes_back() -> anyhow::R
     for command in decided.clone() {
         bench.performer.perform(command)?;
     }
-    // Nobody has heard of that when the run has ended.
+    // Nobody has received this event when the run has ended.
     let (events, answers) = mpsc::channel(8);
     let before =
         std::mem::replace(&mut bench.performer, connect_as(&bench.endpoints, "next", None, "task", events).await?);
@@ -2005,13 +2005,13 @@ async fn what_others_hold_now_is_deleted_by_who_comes_back_when_it_is_free_also_
         let mut bench = Bench::new().await?;
         let run = bench.performer.run.clone();
         let channels = Channels::new(&ClientTls::none());
-        // An operator's.
+        // An operator creates a part.
         let operator = ResourceClient::new(&channels, &bench.endpoints.resource_manager, "")?;
         operator.create(Resource::new("part", ResourceClass::Task, "Part")).await?;
         let start = Ledger { session: bench.performer.number, ..ledger(&run, &[]) };
         let mut ledger = start;
         ledger.command(&operate(1, delete("Part")));
-        // It is killed before it has asked for that. Its session ends, and another run gets the part.
+        // The run is killed before it has requested the delete. Its session ends, and another run gets the part.
         let (events, _answers) = mpsc::channel(8);
         let other = connect(&bench.endpoints, "other", events).await?;
         let part = vec![Requirement::new(ResourceOperation::Block, "Part")];
@@ -2031,7 +2031,7 @@ async fn what_others_hold_now_is_deleted_by_who_comes_back_when_it_is_free_also_
         bench = bench.comes_back(false).await?;
         let told = if has_ended { 1 } else { 2 };
         assert_eq!((come_back(&mut bench).await?, bench.units("Part").await?), (told, 0));
-        // Of what is done the log has word.
+        // The log says what is done.
         assert_eq!(bench.performer.confirmed().operation, 1);
         let session = bench.performer.number;
         let (said, closed) = bench.performer.close().await;
@@ -2060,7 +2060,7 @@ async fn of_a_run_that_has_ended_what_was_not_recorded_is_made_and_nothing_else(
     while bench.performer.confirmed().commit < Revision(1) {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
-    // All else is in its log, with its end, when it is killed.
+    // Everything else is in its log, including its end, when it is killed.
     let mut ledger = Ledger { session, ..ledger(&run, &[commit(1), commit(2), operate(2, create("Box", 1))]) };
     ledger.returned.push(lease.id);
     let place = place_of(&bench.endpoints);
@@ -2070,7 +2070,7 @@ async fn of_a_run_that_has_ended_what_was_not_recorded_is_made_and_nothing_else(
     while bench.units("Box").await? == 0 {}
     bench.performer.closed().await?;
     assert_eq!(missing_commits(&place, &ledger).await?, Some(0));
-    // Its session is over, and with it what it had created.
+    // The session is over, and with it the resources that it had created.
     let (events, _answers) = mpsc::channel(1);
     let mut late = connect_as(&bench.endpoints, &run, Some(session), "task", events).await?;
     assert_eq!(late.finish(&fetch_boxes(), ledger.clone(), Timestamp(0)).await?, (0, 0));
@@ -2115,7 +2115,7 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     let (revision, facts) = bench.performer.root().await?;
     assert_eq!((revision, facts.len()), (Revision(1), 1));
 
-    // Somebody else changes it, and nothing is committed twice.
+    // Another run changes the world, and nothing is committed twice.
     let fact = FactKey { predicate: "other".to_owned(), arguments: Vec::new() };
     let changes = vec![Change::Set { fact: fact.clone(), value: Value::Int(1) }];
     bench.performer.world.commit("other/1/2", changes, None).await?;
@@ -2123,7 +2123,7 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     let changed = bench.takes_up(open.clone(), &mirror).await?;
     let facts = vec![(fact, Some(Value::Int(1)))];
     assert_eq!(of_the_world(changed), [Event::WorldChanged { revision: Revision(2), facts }]);
-    // A pool that began anew.
+    // A pool that has lost its state.
     let later = Ledger { first_revision: Revision(9), ..open };
     let refused = check_world(&place_of(&bench.endpoints), &later).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("lost its state")));
@@ -2152,7 +2152,7 @@ async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() ->
     let refused = bench.takes_up(short.clone(), &mirror).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("resume the run again")));
     assert_eq!(bench.performer.root().await?.0, Revision(0));
-    // With the whole log it has both, and the checkpoint is enough from then on.
+    // From the whole log both are made, and the checkpoint is enough from then on.
     assert_eq!(of_the_world(bench.takes_up(whole, &mirror).await?), []);
     assert_eq!(bench.performer.confirmed().commit, Revision(2));
     assert!(remembers(&place_of(&bench.endpoints), &short).await?);
@@ -2161,7 +2161,7 @@ async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() ->
     bench.performer.closed().await
 }
 
-/// `hang` ends when it is told to stop, `brake` a while after that; `work` at once.
+/// `hang` ends when it is cancelled, `brake` a while after that, `work` at once.
 struct Arm(&'static str);
 
 #[tonic::async_trait]
@@ -2184,7 +2184,7 @@ impl Action for Arm {
     }
 }
 
-/// The bench's arm performs goals.
+/// Lets the bench's arm perform goals.
 async fn serve_arm(bench: &mut Bench) -> anyhow::Result<(ActionServer, String)> {
     let arm = ActionServer::builder("").one_at_a_time().action(Arm("hang")).action(Arm("brake")).action(Arm("work"));
     let arm = arm.build();
@@ -2197,7 +2197,7 @@ async fn serve_arm(bench: &mut Bench) -> anyhow::Result<(ActionServer, String)> 
     Ok((arm, endpoint))
 }
 
-/// A goal for it under this lease.
+/// Starts a goal of the arm under this lease.
 fn start(instance: InstanceId, attempt: u32, action: &str, lease: LeaseId, endpoint: &str) -> Command {
     let resource = LeasedResource {
         id: "arm".to_owned(),
@@ -2232,7 +2232,7 @@ async fn a_lease_goes_back_when_every_goal_under_it_has_ended() -> anyhow::Resul
     bench.ask(routine)?;
     let lease = bench.granted(routine).await?;
     let (arm, endpoint) = serve_arm(&mut bench).await?;
-    // A motion of the routine loses a race: it is told to stop, what it looked at goes back, and the routine ends.
+    // A motion of the routine loses a race: it is cancelled, its projection goes back, and the routine ends.
     bench.performer.perform(start(motion, 1, "brake", lease, &endpoint))?;
     while arm.running() == 0 {
         tokio::task::yield_now().await;
@@ -2263,7 +2263,7 @@ async fn a_goal_waits_for_one_of_the_same_resource_that_was_told_to_stop() -> an
         while arm.running() == 0 {
             tokio::task::yield_now().await;
         }
-        // What a limit cuts short, and what is done on the way out of it, which is cut short in turn and tried again.
+        // A goal that a limit cuts short, and a goal on the way out, which is cut short in turn and tried again.
         bench.performer.perform(Command::Cancel { instance: first, attempt: 1 })?;
         bench.performer.perform(start(second, 1, "hang"))?;
         bench.performer.perform(Command::Cancel { instance: second, attempt: 1 })?;
@@ -2290,7 +2290,7 @@ async fn a_goal_without_a_projection_begins_when_what_was_decided_before_it_is_i
     let (_arm, endpoint) = serve_arm(&mut bench).await?;
     let work = |instance| start(instance, 1, "work", lease, &endpoint);
     let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
-    // The commit is on its way for long.
+    // The commit is under way for long.
     let (disk, slow) = Mark::not_yet();
     let commit = Command::Commit {
         instance: first,
@@ -2301,7 +2301,7 @@ async fn a_goal_without_a_projection_begins_when_what_was_decided_before_it_is_i
     };
     bench.performer.perform_when(Some(slow), commit)?;
     bench.performer.perform(work(first))?;
-    // One that is told to stop meanwhile is never given; one with a projection waits for nothing.
+    // A goal that is cancelled meanwhile is never given; a goal with a projection does not wait.
     bench.performer.perform(work(second))?;
     bench.performer.perform(Command::Cancel { instance: second, attempt: 1 })?;
     let Command::Start { instance, attempt, mut goal } = work(third) else { bail!("it is a start") };
@@ -2324,7 +2324,7 @@ async fn a_goal_of_before_that_was_never_given_waits_for_what_was_decided_before
     let mut bench = Bench::new().await?;
     let (first, second) = (InstanceId(1), InstanceId(2));
     let (_arm, endpoint) = serve_arm(&mut bench).await?;
-    // Whoever offers the arm is sure to be the same after a short while.
+    // The arm is offered in a session with a short time to live, which soon proves whether it is the same.
     let channels = Channels::new(&ClientTls::none());
     let manager = bench.endpoints.resource_manager.clone();
     let robot = Session::open(&channels, &manager, "brief", Duration::from_secs(1));
@@ -2343,7 +2343,7 @@ async fn a_goal_of_before_that_was_never_given_waits_for_what_was_decided_before
         }
         *goal
     };
-    // The commit is on its way for long; the log says that both goals are given, and the provider knows neither.
+    // The commit is under way for long; the log says that both goals were given, and the provider knows neither.
     let (disk, slow) = Mark::not_yet();
     bench.performer.perform_when(Some(slow), commits(1, 1))?;
     bench.performer.start(first, 1, goal(first), Given::Before, None);
@@ -2388,7 +2388,7 @@ async fn a_projection_behind_a_commit_that_waits_for_the_disk_leaves_with_it_and
     let bench = Bench::new().await?;
     let (place, channels) = (tempfile::tempdir()?, Channels::new(&ClientTls::none()));
     let pool = place.path().join("pool.sock");
-    // It answers nothing: whether it is called at all is what counts.
+    // The socket answers nothing: the test checks whether it is called at all.
     let listener = tokio::net::UnixListener::bind(&pool)?;
     let (events, _answers) = mpsc::channel(8);
     let recorder = Recorder {

@@ -134,7 +134,7 @@ impl ResourceClient {
         Ok(self.consume_target(request, requirement, "").await?.resource_ids)
     }
 
-    /// As [`ResourceClient::consume_once`], of one resource alone if one is named. Returns how much of which, if the manager says that.
+    /// As [`ResourceClient::consume_once`], from only one resource if one is named. Returns the amount for each resource, if the manager reports it.
     ///
     /// # Errors
     /// [`CallError`].
@@ -161,14 +161,14 @@ impl ResourceClient {
         Ok(answer.into_inner())
     }
 
-    /// What was done, if it is said of every resource.
+    /// The reported units, if they are reported for every resource.
     fn units(&self, ids: &[String], units: Vec<v1::OperatedUnits>) -> Result<Option<Vec<OperatedUnits>>, CallError> {
         let is_said = units.len() == ids.len();
         let units = each(units, "units").map_err(|m| self.malformed(m))?;
         Ok(is_said.then_some(units))
     }
 
-    /// What requests of before were answered, in the order of these ids: `None` where that is not known.
+    /// The results of earlier requests, in the order of these ids; `None` if a result is not known.
     ///
     /// # Errors
     /// [`CallError`].
@@ -216,7 +216,7 @@ impl ResourceClient {
         Ok(self.delete_target(request, target).await?.resource_ids)
     }
 
-    /// The same; how much of which, if the manager says that.
+    /// The same; returns the amount for each resource, if the manager reports it.
     ///
     /// # Errors
     /// [`CallError`].

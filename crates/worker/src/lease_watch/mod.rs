@@ -389,7 +389,7 @@ impl LeaseWatch {
                 // A closed session reports nothing more, and this watch ends with it.
                 let mut state = state.clone();
                 let Ok(now) = state.wait_for(|s| s.alive).await.map(|s| *s) else { pending().await };
-                // What was made anew has nothing of before.
+                // A session that was opened again has no leases from before.
                 (ResourceClient::clone(client), id.as_str(), now.generation, now.found && now.generation == 1)
             }
             Source::Location { channels, location, provider_session } => {

@@ -17,7 +17,7 @@ use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
 use tonic::Status;
 
-/// What a keep-alive came to.
+/// The result of a keep-alive.
 #[derive(Debug)]
 pub(in super::super) struct KeptAlive {
     pub(in super::super) ttl: Duration,
@@ -37,11 +37,11 @@ pub(in super::super) struct Ping {
     pub(super) answer: Answer<KeptAlive>,
 }
 
-/// What a session says that it is beside others.
+/// The standing that a session claims beside others.
 #[derive(Debug, Clone, Copy, Default)]
 pub(in super::super) struct Claim {
     pub(in super::super) share: Share,
-    /// When its task is due, from now on; negative where that has passed.
+    /// In how many milliseconds its task is due; negative if that has passed.
     pub(in super::super) due_in_ms: Option<i64>,
 }
 
@@ -55,7 +55,7 @@ impl Claim {
     }
 }
 
-/// What the service asks of the actor.
+/// A request of the service to the actor.
 #[derive(Debug)]
 pub(in super::super) enum Message {
     Perform {
@@ -82,24 +82,24 @@ pub(in super::super) enum Message {
         request_id: String,
         answer: Answer<bool>,
     },
-    /// The call was dropped after its answer and before it was read.
+    /// The call was dropped after its answer was sent and before it was read.
     Return {
         lease: LeaseId,
     },
-    /// The client has heard of no answer to this request, and does not want one any more.
+    /// The client has got no answer to this request, and does not want one any more.
     Undo {
         speaker: Speaker,
         session: SessionId,
         request_id: String,
     },
-    /// What requests of before were answered.
+    /// The answers to earlier requests.
     Recall {
         speaker: Speaker,
         session: SessionId,
         request_ids: Vec<String>,
         answer: Answer<Vec<Option<Reply>>>,
     },
-    /// Looks at so many more resources; whether it has looked at all.
+    /// Examines some more resources; the answer says whether it examined any.
     Search {
         search: Search,
         resources: usize,
@@ -109,7 +109,7 @@ pub(in super::super) enum Message {
         id: String,
         answer: oneshot::Sender<Option<ResourceView>>,
     },
-    /// At most so many of those behind an id.
+    /// At most so many resources after an id.
     List {
         after: String,
         most: usize,
@@ -118,18 +118,18 @@ pub(in super::super) enum Message {
     Revision {
         answer: oneshot::Sender<Revision>,
     },
-    /// Some of those behind an id.
+    /// Some sessions after an id.
     Sessions {
         after: String,
         answer: oneshot::Sender<Vec<SessionStatus>>,
     },
-    /// The waiter of a request id, the caller's own before those of others; or the first of the queue; and how many wait.
+    /// The waiter of a request id (the caller's own before those of others), or the first of the queue; and the number of waiters.
     Waiters {
         caller: Arc<str>,
         request_id: String,
         answer: Answer<(Vec<WaiterId>, usize)>,
     },
-    /// Why the first of these wait, and how many of them that is.
+    /// Why the first of these wait, and how many of them were explained.
     Explain {
         waiters: Vec<WaiterId>,
         answer: oneshot::Sender<(Vec<WaitingAcquire>, usize)>,
@@ -149,7 +149,7 @@ pub(in super::super) enum Message {
         answer: Answer<()>,
     },
     Watch {
-        /// Without a snapshot: what happened after this.
+        /// If set, without a snapshot: the events after this position.
         after: Option<WatchPosition>,
         filter: Arc<WatchFilter>,
         answer: Answer<mpsc::Receiver<WatchMessage>>,
@@ -174,9 +174,9 @@ impl Handle {
     }
 }
 
-/// Calls that arrive together are handled by separate tasks, so in no order of their own: the most urgent acquire goes first,
-/// and what is given back comes after those who ask for it. The rest keeps its order, and no acquire goes past the end of a call that
-/// came before it: it may be the same request, asked again.
+/// Orders calls that arrived together, which are handled by separate tasks and so have no order of their own: the most urgent acquire goes first, and
+/// releases come after acquires. All other calls keep their order, and no acquire passes the end of an earlier call: it may be the same request,
+/// repeated.
 pub(super) fn most_urgent_first(messages: &mut [Message]) {
     let ends_call = |message: &Message| {
         use Message::{Abandon, Return, Undo, Withdraw};
@@ -211,7 +211,7 @@ mod tests {
         Message::Withdraw { speaker, session, request_id, answer: oneshot::channel().0 }
     }
 
-    /// By ticket; what is no acquire by a name.
+    /// The order of messages: tickets of acquires, names of others.
     fn sorted(mut messages: Vec<Message>) -> Vec<String> {
         most_urgent_first(&mut messages);
         let name = |message: &Message| match message {

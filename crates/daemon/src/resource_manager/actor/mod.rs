@@ -1,7 +1,7 @@
 //! The resource pool as the core of an actor: requests, deadlines, and replies to callers.
 //!
-//! A grant whose call was dropped at the same moment is released at once. Pings of sessions come first: a
-//! session does not expire because there is much to do.
+//! A grant whose call was dropped at the same moment is released at once. Pings of sessions are handled first: a session does not expire because the
+//! actor is busy.
 
 mod calls;
 mod demands;
@@ -41,22 +41,22 @@ type ResourceTurn = TurnContext<ResourceCore>;
 pub(super) struct ResourceCore {
     config: ResourceManagerConfig,
     pool: Pool,
-    /// Nobody waits in the queue any more.
+    /// Nobody may wait in the queue any more.
     draining: bool,
-    /// Who waits for the answer of which waiter; a repeated request joins.
+    /// The calls that wait for the answer of each waiter; a repeated request joins.
     calls: BTreeMap<WaiterId, Vec<(u64, oneshot::Sender<Granted>)>>,
     tickets: BTreeMap<u64, WaiterId>,
-    /// How many calls got a lease, where its request was repeated: as many have to be dropped before it goes back.
+    /// Number of calls that got a lease because its request was repeated: all of them have to be dropped before the lease goes back.
     shared: BTreeMap<LeaseId, usize>,
-    /// Calls that repeat a request that was granted, until they are answered; by ticket.
+    /// By ticket: calls that repeat a granted request, until they are answered.
     repeated: BTreeMap<u64, (Lease, oneshot::Sender<Granted>)>,
-    /// What waits for more than exists.
+    /// The resources that are missing.
     demand: Vec<ratn_resources::Demand>,
-    /// What of it is asked of whom.
+    /// The providers, and the part of the demand that each is asked for.
     providers: Providers,
-    /// Sessions whose last record may not be on the disk yet, and how many records that are.
+    /// Sessions with records that may not be on disk yet, and the number of these records.
     opening: BTreeMap<SessionId, usize>,
-    /// What everybody may know of.
+    /// The last revision that clients may know.
     told: Revision,
     metrics: Arc<Metrics>,
 }
@@ -87,14 +87,14 @@ pub(super) fn start(
     durable_actor::start(core, journal, live, vitals, draining, over)
 }
 
-/// What leaves when its records are on the disk, besides direct answers.
+/// Output, besides direct answers, that is sent when its records are on disk.
 #[derive(Debug)]
 pub(super) enum Said {
-    /// Of the pool.
+    /// A notice of the pool.
     Notice(Notice),
-    /// To a call that repeated its request after that was granted.
+    /// The answer to a call that repeated a granted request.
     GrantedAgain { ticket: u64 },
-    /// What a ping has changed of a session is on the disk.
+    /// The change of a session by a ping is on disk.
     SessionKept(SessionId),
 }
 
@@ -147,11 +147,11 @@ impl Core for ResourceCore {
                 .map_err(|error| status::of_error(&error)),
         };
         if kept.is_ok() && !ttl.is_zero() {
-            // It was there a moment ago.
+            // The session existed a moment ago.
             let _ = self.pool.set_standing(context.now(), &session, claim.at(context.now()));
         }
         match kept {
-            // Nothing has changed that would have to be on the disk: however slow that is, it ends no session.
+            // Nothing has changed that must be on disk: a slow disk does not end sessions.
             Ok(kept)
                 if before == Some(kept.ttl.max(MIN_SESSION_TTL))
                     && !kept.created
@@ -215,7 +215,7 @@ impl Core for ResourceCore {
             Message::Return { lease } => self.give_back(lease, context),
             Message::Undo { speaker, session, request_id } => {
                 if self.may_speak(now, &speaker, Some(&session)).is_ok() {
-                    // Another session's is not undone.
+                    // A request of another session is not undone.
                     let _ = self.pool.undo(now, &session, &request_id);
                 }
             }
@@ -257,11 +257,11 @@ impl Core for ResourceCore {
         }
     }
 
-    /// Takes over the bounds of a config; the rest needs a restart.
+    /// Applies the limits of a config; other changes need a restart.
     fn signal(&mut self, config: &ResourceManagerConfig, context: &mut ResourceTurn) {
         let ResourceManagerConfig { max_session_ttl_ms, max_wait_ms, max_watchers, limits, .. } = config.clone();
         self.pool.set_limits(limits.clone());
-        // With wider bounds somebody may be served who waited.
+        // Under wider limits waiting requests may be served.
         if context.stopped().is_none() {
             self.pool.advance(context.now());
         }
@@ -290,7 +290,7 @@ impl Core for ResourceCore {
         }
     }
 
-    /// What takes or makes is refused; what gives back is not.
+    /// Refuses requests that take or create something, but not those that give back.
     fn refuse(message: Message, behind: &Status) -> Option<Message> {
         match message {
             Message::Perform { request: Request::Create { .. } | Request::Consume { .. }, answer, .. } => {
@@ -305,7 +305,7 @@ impl Core for ResourceCore {
         }
     }
 
-    /// A resource may have as many attributes as a message holds.
+    /// A create may have as many attributes as fit in a message.
     fn is_large(message: &Message) -> bool {
         matches!(message, Message::Perform { request: Request::Create { .. }, .. })
     }
@@ -314,7 +314,7 @@ impl Core for ResourceCore {
         most_urgent_first(messages);
     }
 
-    /// Whoever waits is told, and leaves the queue.
+    /// Tells all waiting calls, and removes their waiters from the queue.
     fn drain(&mut self, context: &mut ResourceTurn) {
         self.draining = true;
         self.tickets.clear();
@@ -322,7 +322,7 @@ impl Core for ResourceCore {
         tracing::info!(waiting = calls.len(), "draining: nobody is granted anything any more");
         let now = context.now();
         for (waiter, calls) in calls {
-            // Unknown when it was answered in this moment: then the grant finds nobody, and goes back.
+            // Unknown if it was answered at this moment: then the grant finds no call, and goes back.
             let _ = self.pool.cancel(now, waiter);
             for (_, call) in calls {
                 let _ = call.send(Err(ending()));
@@ -340,7 +340,7 @@ impl Core for ResourceCore {
 }
 
 impl ResourceCore {
-    /// Whether the speaker may do something in the name of a session; without one they do it as an operator.
+    /// Checks that the speaker may act for a session; without a session they act as an operator.
     fn may_speak(&mut self, now: Timestamp, speaker: &Speaker, session: Option<&SessionId>) -> Result<(), Status> {
         match session {
             Some(session) => self.pool.check_speaker(now, speaker, session).map_err(|error| status::of_error(&error)),
@@ -375,7 +375,7 @@ impl ResourceCore {
     }
 }
 
-/// Refuses a change. A read is returned, for reads go on, of what is on the disk.
+/// Refuses a change. Returns a read, because reads of what is on disk go on.
 fn refuse_change(message: Message, stopped: Status, context: &mut ResourceTurn) -> Option<Message> {
     match message {
         Message::Perform { answer, .. } => context.reply(answer, Err(stopped)),

@@ -1,4 +1,4 @@
-//! gRPC in front of the actor: checks what the schema cannot say, and undoes what a dropped call was about to get.
+//! gRPC in front of the actor: checks what the schema cannot express, and undoes grants to dropped calls.
 //!
 //! ```text
 //!   Service ──one file for each kind of call──▶ resources, acquires, leases, sessions, demand, watches
@@ -71,14 +71,14 @@ impl Service {
         self.requests.actor().send_later(Message::Return { lease });
     }
 
-    /// Gives back what a request was granted, whatever calls were answered with it: the caller has heard of none.
+    /// Gives back what a request was granted, whichever calls were answered with it: the caller has read no answer.
     pub(super) fn undo_later(&self, caller: &Caller, session: &str, request_id: String) {
         let (speaker, session) = (speaker(caller), SessionId::from(session));
         self.requests.actor().send_later(Message::Undo { speaker, session, request_id });
     }
 }
 
-/// The caller of a request, and what it asks.
+/// The caller of a request, and its message.
 fn parts<T>(request: Request<T>) -> (Caller, T) {
     (Caller::of(&request), request.into_inner())
 }

@@ -1,6 +1,6 @@
-//! What whoever gives a resource back leaves to be told to its next holders, and the session that left it. Whoever was told something stands
-//! for it: what they leave takes its place. Of those who hold one beside each other nobody was told of the others, and what each leaves is
-//! kept. All of it is in memory only: whoever starts anew knows of nothing.
+//! Notes that holders of a resource leave for its next holders, with the session that left them. A holder has read the notes that were there, so its
+//! own note replaces them. Holders beside each other have not read each other's notes, so all their notes are kept. Notes are in memory only: a
+//! restarted manager has none.
 
 use ratn_model::id::LeaseId;
 use ratn_model::resource::Lease;
@@ -10,11 +10,11 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// What was left longer ago is not told: it is about what is on its way.
+/// Older notes are not reported: they are about what is still under way.
 const LIFE: Duration = Duration::from_secs(60);
-/// Of more leases or resources nothing is kept; the oldest are given up first.
+/// Maximum number of leases, and of resources, with notes; the oldest are removed first.
 const MOST: usize = 65_536;
-/// At one resource the last so many are kept: as many as there are runs beside each other.
+/// Maximum number of notes for one resource: as many as there are runs beside each other.
 const MOST_OF_ONE: usize = 64;
 
 /// The notes; clones share them.
@@ -23,16 +23,16 @@ pub(super) struct Notes(Arc<Mutex<Kept>>);
 
 #[derive(Debug, Default)]
 struct Kept {
-    /// Leases that were granted.
+    /// Granted leases.
     held: BTreeMap<LeaseId, Held>,
-    /// By resource, each session's last.
+    /// By resource: the last note of each session.
     notes: HashMap<String, Vec<Note>>,
 }
 
 #[derive(Debug, Clone)]
 struct Held {
     session: String,
-    /// Who asked for it: nobody else leaves a note in the session's name.
+    /// The caller who asked for it: nobody else leaves a note in the session's name.
     caller: Arc<str>,
     resources: Vec<String>,
     since: Instant,
@@ -45,15 +45,15 @@ struct Note {
     since: Instant,
 }
 
-/// What was done for a lease that is to be given back: the note that was left, where it was, and the notes whose place it took there.
+/// The effect of a lease that is to be given back: its note, if it left one, and the notes that this replaced.
 #[derive(Debug, Default)]
 pub(super) struct Left(Option<(Note, Vec<Replaced>)>);
 
-/// A resource, and the notes that were there.
+/// A resource, and its notes that were replaced.
 type Replaced = (String, Vec<Note>);
 
 impl Notes {
-    /// A lease was granted to a session, for which this caller speaks: what is to be told of its resources, each note once.
+    /// A lease was granted to a session of this caller: returns the notes about its resources, each once.
     pub(super) fn of(&self, lease: &Lease, session: &str, caller: &Arc<str>, now: Instant) -> Vec<HolderNote> {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let resources: Vec<String> = lease.resources.iter().map(|resource| resource.id.clone()).collect();
@@ -74,8 +74,8 @@ impl Notes {
         told
     }
 
-    /// A lease is to be given back by this session with this note; an empty one leaves what there is, and so does that of somebody who did not ask for
-    /// the lease. It is followed by [`Notes::ended`] or [`Notes::take_back`].
+    /// A lease is to be given back by this session with this note. An empty note changes nothing, nor does the note of a caller who did not ask for
+    /// the lease. [`Notes::ended`] or [`Notes::take_back`] follows.
     pub(super) fn left(&self, lease: LeaseId, session: &str, caller: &str, note: &str, now: Instant) -> Left {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let is_own = |held: &&Held| held.session == session && *held.caller == *caller;
@@ -98,13 +98,13 @@ impl Notes {
         Left(Some((left, replaced)))
     }
 
-    /// A lease has ended: nobody leaves anything for it any more.
+    /// A lease has ended: no note can be left for it any more.
     pub(super) fn ended(&self, lease: LeaseId) {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         kept.held.remove(&lease);
     }
 
-    /// It was not given back after all: its note goes, and those whose place it took are back, but where their sessions have left others since.
+    /// The lease was not given back after all: its note is removed, and the replaced notes return, unless their sessions have left newer ones.
     pub(super) fn take_back(&self, left: Left) {
         let Left(Some((left, replaced))) = left else { return };
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -161,7 +161,7 @@ mod tests {
         leaves(2, "b", "");
         assert_eq!(told(3, &["arm"], LIFE / 2), ["a: one"], "who has nothing to tell takes nothing away");
         assert_eq!(told(4, &["arm"], LIFE), [""; 0], "what is long ago");
-        // Lease 3 has ended by itself: its holder comes back too late, and is refused.
+        // Lease 3 has ended by itself: its holder releases it too late, and is refused.
         notes.take_back(leaves(3, "b", "late"));
         leaves(4, "a", "not its own");
         assert_eq!(told(5, &["arm"], Duration::ZERO), ["a: one"]);
@@ -200,17 +200,17 @@ mod tests {
             notes.of(&lease(id, &["table"]), session, &caller(), now);
         }
         notes.left(LeaseId(1), "a", "control", "of a", at(1));
-        // A stranger in its name is not heard at all.
+        // The note of another caller in the session's name is ignored.
         let stranger = notes.left(LeaseId(2), "b", "stranger", "a lie", at(2));
         assert_eq!(told(10, 2), ["of a"]);
-        // One that is refused, and meanwhile another leaves a note at the same place, and the holder asks again.
+        // A release is refused; meanwhile another holder leaves a note at the same resource, and the first releases again.
         let refused = notes.left(LeaseId(2), "b", "control", "of b", at(3));
         notes.left(LeaseId(3), "c", "control", "of c", at(4));
         notes.left(LeaseId(2), "b", "control", "of b again", at(5));
         notes.take_back(stranger);
         notes.take_back(refused);
         assert_eq!(told(11, 6), ["of b again", "of c", "of a"]);
-        // A note that took the place of others gives it back.
+        // When a note is taken back, the notes that it replaced return.
         notes.ended(LeaseId(2));
         let late = notes.left(LeaseId(11), "next", "control", "late", at(7));
         assert_eq!(told(12, 7), ["late"]);

@@ -13,11 +13,11 @@ use ratn_proto::v1;
 use ratn_resources::{Reply, Request, ResourceSpec, Search};
 use tonic::{Code, Status};
 
-/// Resources that are looked at in one turn for a list.
+/// Maximum number of resources examined in one turn for a list.
 const LISTED_AT_ONCE: usize = 4_096;
-/// Resources that are looked at in one turn to see whether they fit.
+/// Maximum number of resources examined in one turn by a search.
 const SEARCHED_AT_ONCE: usize = 10_000;
-/// Ids that an answer names.
+/// Maximum number of ids in an answer.
 const MOST_IDS: usize = 1_000;
 
 pub(super) async fn create(
@@ -30,7 +30,7 @@ pub(super) async fn create(
         let message = format!("{caller} may not create resources of the class {}", resource.class);
         return Err(status(Code::PermissionDenied, "ROLE_MISSING", message));
     }
-    // Goals go where the endpoint of a granted resource says: only providers say where that is.
+    // Goals are sent to the endpoint of a granted resource: only providers may set it.
     if !caller.may_create(ResourceClass::Module) && resource.attributes.contains_key(ENDPOINT_ATTRIBUTE) {
         let message = format!(
             "{caller} may not create a resource with the attribute `{ENDPOINT_ATTRIBUTE}`: goals would be given there, and only agents \
@@ -73,7 +73,7 @@ pub(super) async fn consume(
     Ok(v1::ConsumeResponse { resource_ids, revision, consumed })
 }
 
-/// The ids of the resources, and how much of each; nothing of that where an earlier version performed the request.
+/// The ids of the resources, and the amount for each; no amounts if an earlier version performed the request.
 fn operated(reply: Reply) -> Result<(Vec<String>, Vec<v1::OperatedUnits>), Status> {
     match reply {
         Reply::Operated(units) => {
