@@ -39,6 +39,11 @@ impl Leaving {
         self.told.clone()
     }
 
+    /// Whether the held object touches something.
+    pub(crate) fn is_of_held(&self) -> bool {
+        self.touches.iter().any(|touch| touch.is_held)
+    }
+
     /// The shortest way out of that, in the world frame, of length 1.
     pub(crate) fn shortest_way_out(&self) -> Option<[f64; 3]> {
         self.shortest_way_out

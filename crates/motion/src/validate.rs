@@ -103,7 +103,7 @@ pub fn validate_trajectory(
     check_rest(robot.arm_joints(), &trajectory)?;
     check_limits(robot.arm_joints(), &trajectory)?;
     let mut checker = Checker::new(robot, scene, here, 0.0);
-    check_collisions(&mut checker, &trajectory, contact)?;
+    check_collisions_while(&mut checker, &trajectory, contact, &mut || true)?;
     Ok(trajectory)
 }
 
@@ -175,18 +175,24 @@ pub(crate) fn check_limits(joints: &[Joint], trajectory: &Curve) -> Result<(), V
     Ok(())
 }
 
-/// All of a motion, at whose start the gripper may be in something: that is left first, as a retreat does ([`Leaving`]).
-fn check_collisions(checker: &mut Checker<'_>, trajectory: &Curve, contact: Contact) -> Result<(), Violation> {
+/// Checks all of a motion, at whose start the gripper may be in something: that is left first, as a retreat does ([`Leaving`]). `goes_on` is asked
+/// before each look of the rest; returns whether all of it was looked at.
+pub(crate) fn check_collisions_while(
+    checker: &mut Checker<'_>,
+    trajectory: &Curve,
+    contact: Contact,
+    goes_on: &mut dyn FnMut() -> bool,
+) -> Result<bool, Violation> {
     let whole = [0.0, trajectory.duration_s()];
     let start = trajectory.knots()[0].positions;
     let stands_in = if checker.is_free(&start, contact) { None } else { Leaving::from(checker, &start) };
     let Some(leaving) = stands_in else {
-        return check_part(checker, trajectory, whole, contact, &mut || true).map(|_| ());
+        return check_part(checker, trajectory, whole, contact, goes_on);
     };
     let mut rest = leaving.of_the_rest(checker);
     let left_s = left_after_s(leaving, checker, trajectory)?;
-    check_part(&mut rest, trajectory, [0.0, left_s], contact, &mut || true)?;
-    check_part(checker, trajectory, [left_s, whole[1]], contact, &mut || true).map(|_| ())
+    Ok(check_part(&mut rest, trajectory, [0.0, left_s], contact, goes_on)?
+        && check_part(checker, trajectory, [left_s, whole[1]], contact, goes_on)?)
 }
 
 /// When everything that was touched at the start has been left.
@@ -206,16 +212,6 @@ fn left_after_s(mut leaving: Leaving, checker: &mut Checker<'_>, trajectory: &Cu
         }
     }
     Err(Violation::Collision { time_s: trajectory.duration_s(), collision: leaving.told() })
-}
-
-/// As [`check_part`] of the whole motion, as long as `goes_on`, which is asked before each look, says yes; whether all of it was looked at.
-pub(crate) fn check_collisions_while(
-    checker: &mut Checker<'_>,
-    trajectory: &Curve,
-    contact: Contact,
-    goes_on: &mut dyn FnMut() -> bool,
-) -> Result<bool, Violation> {
-    check_part(checker, trajectory, [0.0, trajectory.duration_s()], contact, goes_on)
 }
 
 /// Looks at the middle of a piece of the curve: where there is more room than anything moves from there within the piece, the piece is

@@ -14,6 +14,8 @@ pub(crate) struct Touch {
     /// By their numbers in the checker.
     moving: usize,
     obstacle: usize,
+    /// Whether the held object touches, not the gripper itself.
+    pub(crate) is_held: bool,
     /// How deep it is in it, in metres, without any padding.
     pub(crate) depth_m: f64,
 }
@@ -24,10 +26,12 @@ impl<'a> Checker<'a> {
         self.place(arm);
         let mut touches = Vec::new();
         for (i, moving) in self.moving.iter().enumerate().filter(|(_, moving)| moving.role != Role::Arm) {
-            for &o in moving.obstacles.iter().filter(|o| self.is_object(**o)) {
+            // Fingers in a hollow object are in its filled shape, and touch nothing.
+            let is_in_hollow = |o: usize| moving.role == Role::Finger && self.obstacles[o].entry == Entry::Open;
+            for &o in moving.obstacles.iter().filter(|o| self.is_object(**o) && !is_in_hollow(**o)) {
                 let depth_m = self.depth_in(i, o);
                 if depth_m > 0.0 {
-                    touches.push(Touch { moving: i, obstacle: o, depth_m });
+                    touches.push(Touch { moving: i, obstacle: o, is_held: moving.role == Role::Held, depth_m });
                 }
             }
         }

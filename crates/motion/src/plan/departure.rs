@@ -13,12 +13,21 @@ use crate::pace::Pace;
 pub(super) fn departure(arm: &mut ArmInScene<'_>, pace: &mut Pace<'_>) -> Result<Vec<JointVector>, PlanError> {
     match with_paddings(arm, pace, padded_departure)? {
         Ok(postures) => Ok(postures),
+        Err(refused) if starts_as_departures_may(arm) => Err(refused),
         Err(refused) => match with_paddings(arm, pace, retreat)? {
             Ok(Some(postures)) => Ok(postures),
             Ok(None) => Err(refused),
             Err(no_retreat) => Err(no_retreat),
         },
     }
+}
+
+/// Whether a departure was asked for and the gripper is no deeper in anything than departures may be. Then what refuses it is farther along
+/// its way, and another way might carry along what stands on the held object, or drag that over its support.
+fn starts_as_departures_may(arm: &mut ArmInScene<'_>) -> bool {
+    let start = arm.request().start.arm;
+    arm.pad(0.0);
+    arm.request().depart.is_some() && arm.collision(&start, Contact::Gripper(CONTACT_TOLERANCE_M)).is_none()
 }
 
 /// The first way that there is, with the greatest padding that allows one, or why there is none with the least.

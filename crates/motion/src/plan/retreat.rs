@@ -32,8 +32,10 @@ fn ways(arm: &ArmInScene<'_>, leaving: &Leaving) -> Vec<(String, Straight, Exten
     let asked = &arm.request().depart;
     let asked = asked.is_some().then(|| (format!("{asked}"), asked.clone(), Extent::Whole));
     let far = |direction, frame| Straight { direction, frame, length_m: MAX_STRAIGHT_M };
-    let back = ("back along the tool".to_owned(), far([0.0, 0.0, -1.0], Frame::Tool), Extent::UntilFree);
+    // Along the tool a held object may slide over what it stands on.
+    let back = (!leaving.is_of_held())
+        .then(|| ("back along the tool".to_owned(), far([0.0, 0.0, -1.0], Frame::Tool), Extent::UntilFree));
     let out = leaving.shortest_way_out();
     let out = out.map(|way| ("the shortest way out".to_owned(), far(way, Frame::World), Extent::UntilFree));
-    asked.into_iter().chain([back]).chain(out).collect()
+    asked.into_iter().chain(back).chain(out).collect()
 }
