@@ -1,5 +1,5 @@
 //! The robot as the planner sees it: links moved by the planned joints, bounding spheres for the fast checks, exact shapes for the others, and the
-//! pairs of links that may touch.
+//! pairs of links that are excepted from checks.
 //!
 //! The joints that are not planned are held where a [`RobotState`] has them.
 

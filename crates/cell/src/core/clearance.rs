@@ -6,8 +6,8 @@
 //!
 //! The comparison runs on the cell's only thread, and an emergency stop has to wait for it, so its work is bounded. Positions that a motion visits
 //! again are kept once, and the positions of a body form a binary tree whose branches are ruled out by one distance each. Beside a standing part,
-//! postures are skipped as long as no joint has moved anything by more than the last distance (conservative advancement, Mirtich 1996). A
-//! comparison that takes more than [`MAX_POSTURES`], [`MAX_DISTANCES`] or [`MAX_SEARCHES`] is given up ([`Crossing::TooLong`]).
+//! postures are skipped as long as no joint has moved anything by as much as there was room at the last comparison (conservative advancement,
+//! Mirtich 1996). A comparison that takes more than [`MAX_POSTURES`], [`MAX_DISTANCES`] or [`MAX_SEARCHES`] is given up ([`Crossing::TooLong`]).
 
 use super::levers::Levers;
 use rapier3d::math::Pose as Pose32;

@@ -16,7 +16,7 @@
 
 use super::lanes::{Block, Isa, Lanes};
 
-/// Approximate maximum number of cells of a grid, and of cells per point.
+/// Approximate maximum number of cells of a grid, and number of cells per point.
 const MOST_CELLS: f32 = 60_000.0;
 const CELLS_PER_POINT: f32 = 10.0;
 

@@ -162,7 +162,7 @@ impl Triangle {
     fn new(corners: [Corner; 3]) -> Triangle {
         let value = value(&corners.map(|row| corners.map(|column| row.way.dot(column.point))));
         let [a, b, c] = corners.map(|corner| corner.way);
-        // The weights of a direction between the corners add up to one at a corner, and nowhere to more than this.
+        // The weights of a direction between the corners add up to one at a corner, and to no more than `most()` anywhere.
         let most = || (b - a).cross(c - a).direction().map_or(f64::INFINITY, |across| 1.0 / across.dot(a).abs());
         Triangle { corners, bound: if value < 0.0 { value * most() } else { value } }
     }

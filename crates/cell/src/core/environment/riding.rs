@@ -2,7 +2,7 @@
 //!
 //! Friction moves objects along with a deck that moves gently. Computing that contact by contact, at every step, is most of what a drive costs,
 //! and always has the same result. So an object that has stood still on the deck for a while is placed relative to the deck: as a body at rest is
-//! put to sleep, only that its support moves.
+//! put to sleep, except that its support moves.
 //!
 //! ```text
 //! free ──all that is awake has stood still on the deck for a while──▶ rides ──the base stands──▶ asleep
@@ -22,7 +22,7 @@ use ratn_motion::robot::{Configuration, Robot, to_f32};
 
 /// Number of steps for which everything has to have stood still on the deck before it rides.
 const STILL_STEPS: u32 = 75;
-/// Maximum speed that counts as standing still, in metres and in radians per second.
+/// Maximum speeds that count as standing still, in metres and in radians per second.
 const STILL_M: f32 = 0.005;
 const STILL_RAD: f32 = 0.05;
 /// Fraction of the limits of friction and foot that is used.
