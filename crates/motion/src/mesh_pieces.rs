@@ -212,7 +212,7 @@ fn thickened(corners: &[Corner]) -> Vec<Corner> {
 fn places(face: &[Corner; 3]) -> Vec<Corner> {
     let [a, b, c] = *face;
     let longest = [[a, b], [b, c], [c, a]].iter().map(|[p, q]| norm(difference(*p, *q))).fold(0.0, f64::max);
-    // No point of a small face is farther than this from its corners, which are points of the mesh.
+    // No point of a small face is farther than `CLOSE_M` from its corners, which are points of the mesh.
     if longest < CLOSE_M {
         return Vec::new();
     }

@@ -397,7 +397,7 @@ impl<'a> ArmInScene<'a> {
         self.rough.duration_s(path)
     }
 
-    /// A free path from a door to one of the doors in `ends`.
+    /// A free path from a door to one of several others.
     pub(super) fn connect(
         &mut self,
         from: &State,
