@@ -1,23 +1,23 @@
-//! Samples drawn ahead for a tree that is shut in, and what is known of its motions towards them.
+//! Look-ahead for a tree that is shut in: samples drawn in advance, and what is known about the motions towards them.
 //!
-//! Nearly all motions of such a tree touch something, most of them in their middle, and mostly something that was touched lately. So the middles of as
-//! many motions as the widest batch has postures are looked at together beside what is remembered, and only motions that are free of that are looked
-//! at further. Samples and answers are those of a search that looks at one motion after the other. What is known stays known while the tree grows,
-//! but for samples that a new node is nearer to.
+//! Nearly all motions of such a tree are in collision, most of them at their middle, and mostly with something that was touched lately. So the
+//! middles of many motions (as many as the widest batch has postures) are checked in one batch against the obstacles that are remembered, and only
+//! motions that pass are checked further. Samples and results equal those of a search that checks one motion after the other. What is known of a
+//! sample stays known while the tree grows, unless a new node is nearer to the sample.
 
 use crate::space::{Space, State, WIDEST, between, distance, towards};
 use crate::tree::Tree;
 
-/// Samples drawn ahead at most: those that are too far from a tree make no motion.
+/// Maximum number of samples drawn ahead. There has to be a bound: samples that are too far from a tree make no motion.
 const MOST: usize = 8 * WIDEST;
 
 /// A sample.
 #[derive(Clone, Copy)]
 pub(crate) struct Drawn {
     pub(crate) sample: State,
-    /// The nearest node and its distance, where that is known.
+    /// The nearest node and its distance, if known.
     pub(crate) nearest: Option<(usize, f32)>,
-    /// A motion towards it of at most this length touches something.
+    /// A motion towards the sample of at most this length is known to be in collision.
     pub(crate) touches: Option<f32>,
 }
 
@@ -32,9 +32,9 @@ pub(crate) struct Ahead<S> {
     /// In the order of drawing; those before `next` are used up.
     drawn: Vec<Drawn>,
     next: usize,
-    /// The motions towards those before this one were looked at.
+    /// The motions towards the samples before this index have been checked.
     looked_at: usize,
-    /// Of which tree.
+    /// Index of the tree that the results belong to.
     which: usize,
 }
 
@@ -43,7 +43,7 @@ impl<S: FnMut() -> State> Ahead<S> {
         Ahead { sample, drawn: Vec::new(), next: 0, looked_at: 0, which: 0 }
     }
 
-    /// The next sample, with what is known of it for this tree.
+    /// Returns the next sample, with what is known of it for this tree.
     pub(crate) fn next(&mut self, which: usize) -> Drawn {
         if self.next == self.drawn.len() {
             return Drawn::new((self.sample)());
@@ -57,7 +57,7 @@ impl<S: FnMut() -> State> Ahead<S> {
         self.which == which && self.next < self.looked_at
     }
 
-    /// A tree has new nodes, from this one on.
+    /// Reports that a tree has new nodes, from the index `first` on.
     pub(crate) fn grown(&mut self, which: usize, tree: &Tree, first: usize) {
         if self.which != which {
             return;
@@ -74,8 +74,8 @@ impl<S: FnMut() -> State> Ahead<S> {
         }
     }
 
-    /// Looks at the motions of a tree towards the next samples, of which at most so many are wanted. `step` has how long a motion is at most, by
-    /// how many samples come before it and by the radius of its node's domain.
+    /// Checks the motions of a tree towards at most `wanted` next samples. `step` returns the maximum length of a motion from the number of
+    /// samples that come before it and the domain radius of its node.
     pub(crate) fn look(
         &mut self,
         space: &mut Space,
@@ -101,7 +101,7 @@ impl<S: FnMut() -> State> Ahead<S> {
             if far <= tree.radii[near] {
                 let step = step(after, tree.radii[near]);
                 let from = &tree.states[near];
-                // Also one of the postures that a look at the whole motion has.
+                // The check of the whole motion has this posture, too.
                 middles[count] = between(from, &towards(from, &drawn.sample, far, step), 0.5);
                 motions[count] = (after, step);
                 count += 1;
@@ -118,7 +118,7 @@ impl<S: FnMut() -> State> Ahead<S> {
         }
     }
 
-    /// Finds the nearest nodes of the next samples from this one on.
+    /// Finds the nearest nodes of the next samples, beginning with the index `from`.
     fn find_nearest(&mut self, tree: &Tree, from: usize, wanted: usize) {
         let end = wanted.min(from + WIDEST);
         while self.drawn.len() < end {

@@ -1,9 +1,9 @@
-//! A robot's arm among the objects of a scene, as the vector checks want it.
+//! A robot's arm among the objects of a scene, as the vector checks need it.
 //!
-//! A [`Mechanism`] of the arm's joints in the frame of the base. What the arm moves (links, hand, fingers, what is held) has
-//! spheres; what it does not move (base, mast, the objects of the scene) are obstacles. The spheres stand out of the shapes by
-//! at most [`OVERHANG_M`] and hold them with at least [`CLEARANCE_M`] to spare. So what the exact check with a padding of `OVERHANG_M`
-//! finds clear of obstacles the spheres do too, and what the spheres find free is free by the exact check with `CLEARANCE_M`.
+//! A [`Mechanism`] of the arm's joints in the frame of the base. What the arm moves (links, hand, fingers, held objects) is covered by spheres;
+//! what it does not move (base, mast, the objects of the scene) are obstacles. The spheres stand out of the shapes by at most [`OVERHANG_M`] and
+//! hold them with at least [`CLEARANCE_M`] to spare. So a posture that the exact check with a padding of `OVERHANG_M` finds free of obstacles is
+//! also free by the spheres, and what the spheres find free is free by the exact check with `CLEARANCE_M`.
 
 use crate::endless::WithEnds;
 use crate::joint_vector::JointVector;
@@ -19,26 +19,26 @@ use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene, Shape};
 use std::collections::BTreeSet;
 
-/// How far the spheres stand out of a shape at most, in metres, unless the shape is very long.
+/// Maximum distance by which the spheres stand out of a shape, in metres, unless the shape is very long.
 pub const OVERHANG_M: f64 = 0.01;
 
-/// How much room they leave around it at least, in metres.
+/// Minimum clearance of the spheres around a shape, in metres.
 pub const CLEARANCE_M: f64 = 0.002;
 
-/// The arm in a scene; motions that the space finds free are free also between their postures.
+/// The arm in a scene. Motions that the space finds free are also free between their postures.
 pub fn space<'s>(mechanism: &Mechanism, surroundings: impl Into<Surroundings<'s>>) -> Space {
     let mut space = Space::new(mechanism, surroundings);
     space.set_swept(true);
     space
 }
 
-/// The arm with what it holds, each held object as a link of its own named `held` and its name, in the scene's order behind the links of the
-/// robot; all of it has its exact shapes. Everything but the arm is as in `here`.
+/// The arm with what it holds. Each held object is a link of its own, named `held` and the object's name, after the links of the robot and in the
+/// scene's order. All links have their exact shapes. Everything but the arm is as in `here`.
 ///
 /// Every check of the arm takes its pairs of links from here ([`Mechanism::is_checked`]).
 pub fn holding(robot: &Robot, scene: &Scene, here: &Configuration) -> Mechanism {
     let mut arm = robot.arm(here);
-    // What holds something and what is held may touch each other.
+    // The gripper and the held object may touch each other.
     let mut grips: Vec<usize> = (0..arm.links.len()).filter(|l| is_gripper(robot, *l)).collect();
     for object in &scene.objects {
         if let Placement::Gripper(pose) = &object.placement {
@@ -49,7 +49,7 @@ pub fn holding(robot: &Robot, scene: &Scene, here: &Configuration) -> Mechanism 
     arm
 }
 
-/// The arm and what is around it, in the frame of the base; everything but arm and base is as in `here`, the base where the scene has it.
+/// The arm and the obstacles around it, in the frame of the base. Everything but arm and base is as in `here`; the base is where the scene has it.
 pub fn in_scene(robot: &Robot, scene: &Scene, here: &Configuration) -> (Mechanism, Vec<Obstacle>) {
     let BySpheres { arm, mut standing, .. } = BySpheres::of(robot, from_base(robot, scene, here));
     standing.extend(objects(robot, scene));
@@ -61,11 +61,11 @@ pub(crate) fn from_base(robot: &Robot, scene: &Scene, here: &Configuration) -> M
     holding(robot, scene, &Configuration { base: [0.0; 3], ..*here })
 }
 
-/// What stands in the scene, in the frame of the base.
+/// The scene's objects that are not held, in the frame of the base.
 pub(crate) fn objects(robot: &Robot, scene: &Scene) -> Vec<Obstacle> {
     let inverse = on_floor(robot, &scene.base).inverse();
     let standing = scene.objects.iter().filter_map(|object| match &object.placement {
-        // `holding` has what is in the gripper, `hands` says where the rest is.
+        // Held objects are in `holding`; `hands` has the poses of the others.
         Placement::World(pose) => {
             let geometry = Geometry::from(&object.shape);
             Some(Obstacle { name: object.name.clone(), pose: inverse.compose(pose), geometry })
@@ -75,18 +75,18 @@ pub(crate) fn objects(robot: &Robot, scene: &Scene) -> Vec<Obstacle> {
     standing.collect()
 }
 
-/// An arm as the vector checks know it.
+/// An arm as the vector checks see it.
 pub(crate) struct BySpheres {
-    /// What moves has spheres.
+    /// The moving links, covered by spheres.
     pub(crate) arm: Mechanism,
     /// The primitives of links that do not move.
     pub(crate) standing: Vec<Obstacle>,
-    /// Of which link each is.
+    /// The link of each primitive in `standing`.
     pub(crate) links: Vec<usize>,
 }
 
 impl BySpheres {
-    /// An arm whose links have their exact shapes. Pairs of which spheres of meshes say nothing are not looked at.
+    /// From an arm whose links have their exact shapes. Pairs of links that the spheres of meshes cannot decide are not checked.
     pub(crate) fn of(robot: &Robot, mut arm: Mechanism) -> BySpheres {
         let resting = arm.poses(&JointVector::zeros(arm.joints.len()));
         let (moving, standing): (Vec<usize>, Vec<usize>) =
@@ -118,8 +118,8 @@ impl BySpheres {
     }
 }
 
-/// Of the pairs of links of which one at least moves with the arm, those that the vector checks do not look at though they are to be kept apart:
-/// spheres say nothing of them. The primitives of what stands are looked at as they are.
+/// Pairs of links, at least one moved by the arm, that are to be kept apart but that the vector checks skip, because spheres cannot decide them.
+/// The primitives of links that do not move are checked exactly.
 pub(crate) fn unseen(robot: &Robot, arm: &Mechanism) -> BTreeSet<Pair> {
     let moves = |link: &usize| robot.arm_links.contains(link);
     let is_unseen = |(a, b): &&Pair| moves(a) && moves(b) || arm.is_by_meshes(*a, *b);
@@ -127,20 +127,20 @@ pub(crate) fn unseen(robot: &Robot, arm: &Mechanism) -> BTreeSet<Pair> {
     by_shapes.filter(is_unseen).copied().collect()
 }
 
-/// The tool of the arm in the frame of the base. Joints that turn without end turn by a whole turn from zero, to either side.
+/// The kinematics of the tool in the frame of the base. Continuous joints may turn one whole turn from zero, to either side.
 pub fn reach(robot: &Robot) -> Reach {
     let zero = robot.at_zero();
     let arm = WithEnds::about(robot, &zero.arm).map_or_else(|| robot.arm(&zero), |arm| arm.robot.arm(&zero));
     Reach::new(&arm, robot.tool, Pose::IDENTITY)
 }
 
-/// What a scene alone leaves to be assumed of the robot: the base stands where the scene has it, the fingers are around what is held, else
-/// open, the head looks straight ahead, and the arm is at zero.
+/// The configuration assumed from a scene alone: the base is where the scene has it, the fingers are around the held object or else open, the head
+/// looks straight ahead, and the arm is at zero.
 pub fn assumed(robot: &Robot, scene: &Scene) -> Configuration {
     Configuration { finger: finger_around_held(robot, scene), ..robot.at_zero().with_base(&scene.base) }
 }
 
-/// The base's place and heading on the floor. A robot without a base stands where its URDF puts it, whatever is said of a base.
+/// The base's position and heading on the floor. A robot without base joints stands where its URDF puts it, whatever the scene says.
 pub fn on_floor(robot: &Robot, base: &Pose) -> Pose {
     if robot.base_joints().is_empty() {
         return Pose::IDENTITY;
@@ -149,7 +149,7 @@ pub fn on_floor(robot: &Robot, base: &Pose) -> Pose {
     Pose::from_rpy([x, y, 0.0], 0.0, 0.0, yaw)
 }
 
-/// Where the fingers are around what is held, else open: each this far from the middle, in metres.
+/// Position of each finger around the held object, or open, in metres from the middle.
 fn finger_around_held(robot: &Robot, scene: &Scene) -> f64 {
     let open = robot.open_finger_m();
     let widths = scene.objects.iter().filter_map(|object| match (&object.placement, &object.shape) {
@@ -163,13 +163,13 @@ fn finger_around_held(robot: &Robot, scene: &Scene) -> f64 {
     widths.map(|w| w / 2.0).next().map_or(open, |finger| finger.min(open))
 }
 
-/// Whether a link is the hand or hangs on it.
+/// Whether a link is the hand or a child of it.
 fn is_gripper(robot: &Robot, link: usize) -> bool {
     let hand = robot.hand();
     hand.is_some() && (Some(link) == hand || robot.model.links[link].parent == hand)
 }
 
-/// Gives a link spheres that hold its bodies.
+/// Covers the bodies of a link with spheres.
 fn cover(link: &mut Link) {
     let grown = |body: &Body| Body { geometry: body.geometry.grown(CLEARANCE_M), ..*body };
     link.spheres = link.bodies.iter().flat_map(|body| cover_within(&grown(body), OVERHANG_M - CLEARANCE_M)).collect();
@@ -185,7 +185,7 @@ pub fn line(reach: &Reach, start: &JointVector, offset: [f64; 3]) -> Result<Vec<
     line::line(reach, start, &moved(reach, start, offset))
 }
 
-/// The same of the nearest postures alone, each solved from the one before.
+/// As `line`, but with the nearest postures only, each solved from the one before.
 ///
 /// # Errors
 /// [`LineError`] where limits or a singular posture end the line early.
@@ -199,7 +199,7 @@ pub(crate) fn moved(reach: &Reach, start: &JointVector, offset: [f64; 3]) -> Pos
     Pose { position: std::array::from_fn(|i| tool.position[i] + offset[i]), ..tool }
 }
 
-/// A posture of the vector checks, within the arm's limits.
+/// A posture of the vector checks as joint positions, within the arm's limits.
 pub fn joints(robot: &Robot, state: &State) -> JointVector {
     robot.clamp(&JointVector::from_fn(robot.arm_joints().len(), |j| f64::from(state[j])))
 }

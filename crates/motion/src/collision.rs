@@ -1,12 +1,14 @@
-//! Does the robot, in a posture of its arm, touch the scene or itself?
+//! Exact collision check: does the robot, in a posture of its arm, touch the scene or itself?
 //!
-//! A [`Checker`] is made once per scene: what stands still (objects, base, mast) becomes a flat array of obstacles, what the
-//! arm moves (links, hand, fingers, the held object) an array of moving shapes. Bounding spheres decide most pairs, distances
-//! decide the rest. Which links are to be kept apart the mechanism says ([`arm::holding`](crate::arm::holding)). It says what touches what and how deep, and where contact is allowed; free motions are searched with the
-//! vector checks of `arm` and `space`. Shapes that move are grown by a padding. Between two postures no further apart than [`Checker::steps`]
-//! allows, nothing is nearer to anything else by more than the padding than in the nearer one: where both are free, the way between is. Meshes are looked
-//! at as they are. Links whose spheres say nothing of each other ([`Checks::by_shapes`](crate::pairs::Checks::by_shapes)) may be built to run closer to each
-//! other than the padding, and have none: of those the finished motion is checked, from posture to posture (`validate`).
+//! A [`Checker`] is made once per scene: what stands still (objects, base, mast) becomes a flat array of obstacles, what the arm moves (links,
+//! hand, fingers, the held object) an array of moving shapes. Bounding spheres decide most pairs, distances decide the rest. The mechanism
+//! ([`arm::holding`](crate::arm::holding)) defines which links are to be kept apart. The checker reports what touches what, how deep, and where
+//! contact is allowed; free motions are searched with the vector checks of `arm` and `space`.
+//!
+//! Moving shapes are grown by a padding. Between two postures no further apart than [`Checker::steps`] allows, no distance is smaller by more than
+//! the padding than in the nearer posture: if both are free, the motion between them is. Meshes are checked as they are. Pairs of links that
+//! spheres cannot decide ([`Checks::by_shapes`](crate::pairs::Checks::by_shapes)) may be built to run closer to each other than the padding, so
+//! they have none: for these pairs the finished motion is checked, from posture to posture (`validate`).
 
 use crate::cloud::Cloud;
 use crate::confirmed::Couples;
@@ -31,17 +33,16 @@ mod touching;
 
 pub(crate) use touching::Touch;
 
-/// How much room the planner keeps around the moving shapes where it begins and ends, in metres.
+/// Clearance that the planner keeps around the moving shapes at the start and the end, in metres.
 pub const PADDING_M: f64 = crate::arm::OVERHANG_M;
 
-/// How deep the fingers and the held object may press into what they touch where contact is allowed, in metres: poses are
-/// measured, the arm is compliant.
+/// Maximum penetration of the fingers and the held object where contact is allowed, in metres: poses are measured, and the arm is compliant.
 pub const CONTACT_TOLERANCE_M: f64 = 0.012;
 
-/// How much larger the sphere around a mesh is taken, for rounding, as a part of it.
+/// Relative enlargement of the bounding sphere of a mesh, for rounding.
 const ROUNDED: f64 = 1e-5;
 
-/// How far a point may move between two checked postures when there is no padding, in metres.
+/// Maximum distance that a point moves between two checked postures if there is no padding, in metres.
 const UNPADDED_STEP_M: f64 = 0.005;
 
 /// Checks postures against one scene.
@@ -49,7 +50,7 @@ const UNPADDED_STEP_M: f64 = 0.005;
 pub struct Checker<'a> {
     robot: &'a Robot,
     padding: f64,
-    /// Where everything is; the arm as in the posture checked last.
+    /// Positions of all joints; the arm's are those of the posture checked last.
     configuration: Configuration,
     obstacles: Vec<Obstacle>,
     moving: Vec<Moving>,
@@ -57,10 +58,9 @@ pub struct Checker<'a> {
     pairs: Vec<(usize, usize)>,
     /// Links with meshes that have no padding beside each other.
     close: BTreeSet<Pair>,
-    /// Balls that stand around, in the world frame.
+    /// Point cloud of balls around the robot, in the world frame.
     cloud: Option<Arc<Cloud>>,
-    /// How far a point moves at the most per radian of each arm joint (per metre of one that slides), or two shapes that move towards each
-    /// other, in metres.
+    /// Maximum motion of any point, or of two shapes towards each other, per radian of each arm joint (per metre of a prismatic joint), in metres.
     reach: JointVector,
     poses: Vec<Pose>,
     placed: Vec<Pose32>,
@@ -78,24 +78,24 @@ struct Obstacle {
     entry: Entry,
 }
 
-/// What may be in an obstacle where contact is allowed.
+/// What may penetrate an obstacle where contact is allowed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Entry {
-    /// The fingers and what they hold, not deeper than may be pressed.
+    /// The fingers and what they hold, up to the allowed penetration.
     Pressed,
-    /// The fingers may be in it, however deep.
+    /// The fingers, at any depth.
     Open,
-    /// Nothing ever: fingers and what they hold may only be nearer than other things.
+    /// Nothing. Fingers and what they hold may only come closer than the padding.
     Never,
 }
 
-/// A shape of a link or of what stands.
+/// A shape of a link or of an obstacle.
 struct Part {
-    /// There.
+    /// Its pose.
     at: Pose,
     solid: Solid,
     padded: Solid,
-    /// The middle of a sphere around it, in its own frame, how far it reaches from there, and how much farther the padded one does.
+    /// Bounding sphere: its centre in the frame of the shape, and how far the shape reaches from there and how much farther the padded one does.
     middle: Vector,
     reach: [f64; 2],
 }
@@ -103,25 +103,25 @@ struct Part {
 #[derive(Clone)]
 struct Moving {
     name: String,
-    /// Of the arm with what it holds.
+    /// Index in the arm with what it holds.
     link: usize,
-    /// The robot's link that it is fixed to.
+    /// The robot's link that the shape is fixed to.
     frame: usize,
-    /// No joint of the arm moves it against the tool.
+    /// No joint of the arm moves the shape relative to the tool.
     is_with_tool: bool,
     role: Role,
     local: Pose,
     /// Grown by the padding.
     padded: Solid,
     solid: Solid,
-    /// Of a sphere around it, in its own frame.
+    /// Centre of the bounding sphere, in the frame of the shape.
     middle: Vector,
     radius: f32,
-    /// Obstacles that it can meet.
+    /// Indices of the obstacles that it can collide with.
     obstacles: Vec<usize>,
 }
 
-/// What something that moves is there for: what may touch something depends on it.
+/// Role of a moving shape; it decides which contacts are allowed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Role {
     Arm,
@@ -130,25 +130,25 @@ enum Role {
     Held,
 }
 
-/// What may touch what.
+/// The contacts that are allowed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Contact {
-    /// Nothing touches anything.
+    /// No contact.
     None,
-    /// The fingers and the held object may touch anything, pressing in by this many metres at the most.
+    /// The fingers and the held object may touch anything, with at most this penetration in metres.
     Gripper(f64),
 }
 
-/// Two things that meet.
+/// A collision of two things, or too little distance between them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Collision {
-    /// What moves: a link, or what is held.
+    /// The moving one: a link, or a held object.
     pub moving: String,
-    /// What it meets: an object, or a link.
+    /// The other one: an object, or a link.
     pub other: String,
-    /// How deep, in metres; negative: how far apart, where that is less than the padding.
+    /// Penetration in metres. Negative: the distance, where it is less than the padding.
     pub depth_m: f64,
-    /// How far apart they have to be, in metres.
+    /// The required distance, in metres.
     pub padding_m: f64,
 }
 
@@ -159,14 +159,14 @@ impl fmt::Display for Collision {
         if self.depth_m > 0.0 {
             return write!(f, "{moving} is {millimetres:.0} mm inside {other}");
         }
-        // To a tenth: what is nearly far enough is not to read as if it were.
+        // Rounded to a tenth, so that a distance just below the required one does not read as if it were enough.
         let [apart, kept] = [millimetres, self.padding_m * 1000.0].map(|mm| (10.0 * mm).round() / 10.0);
         write!(f, "{moving} is only {apart} mm away from {other}, and {kept} mm are kept between them")
     }
 }
 
 impl<'a> Checker<'a> {
-    /// A checker of `robot` in `scene`, with everything but arm and base as in `here` and the base where the scene has it.
+    /// A checker of `robot` in `scene`. Everything but arm and base is as in `here`; the base is where the scene has it.
     pub fn new(robot: &'a Robot, scene: &Scene, here: &Configuration, padding: f64) -> Checker<'a> {
         let configuration = here.with_base(&scene.base);
         let poses = robot.poses(&configuration);
@@ -192,7 +192,7 @@ impl<'a> Checker<'a> {
         checker
     }
 
-    /// The same, but where contact is allowed the fingers may be in these objects: hollow ones, whose shapes are filled.
+    /// The same checker, but where contact is allowed the fingers may be inside these objects: hollow ones, whose shapes are filled.
     pub fn reaching_into(mut self, objects: &[String]) -> Checker<'a> {
         for obstacle in &mut self.obstacles {
             if obstacle.link.is_none() && objects.contains(&obstacle.name) {
@@ -202,7 +202,7 @@ impl<'a> Checker<'a> {
         self
     }
 
-    /// The same, but nothing that moves may ever be in these boxes of the world.
+    /// The same checker, but nothing that moves may ever enter these boxes, given in the world frame.
     pub fn keeping_out_of(mut self, regions: &[Region]) -> Checker<'a> {
         for (i, Region { pose, size }) in regions.iter().enumerate() {
             let part = Part::standing(&Geometry::from(&Shape::Box { size: *size }));
@@ -214,7 +214,7 @@ impl<'a> Checker<'a> {
         self
     }
 
-    /// The same for these couples alone, and for nothing else. Where one link is looked at beside the cloud, all that are looked at are.
+    /// The same checker for these couples only. If one link is checked against the cloud, all links that are left are.
     pub(crate) fn of(mut self, couples: &Couples) -> Checker<'a> {
         let has = |a: usize, b: usize| couples.pairs.contains(&(a.min(b), a.max(b)));
         let beside = |link: usize, name: &str| couples.beside.contains(&(link, name.to_owned()));
@@ -234,7 +234,7 @@ impl<'a> Checker<'a> {
         self
     }
 
-    /// What moves and meets nothing that it is kept apart from is not looked at any more; of some links it may meet the cloud.
+    /// Drops moving shapes that have nothing left to be checked against. `is_beside_cloud` tells whether a link is checked against the cloud.
     fn forget_idle(&mut self, is_beside_cloud: impl Fn(usize) -> bool) {
         let in_pairs: BTreeSet<usize> = self.pairs.iter().flat_map(|(i, j)| [*i, *j]).collect();
         let is_busy = |moving: &Moving| !moving.obstacles.is_empty() || is_beside_cloud(moving.link);
@@ -247,12 +247,12 @@ impl<'a> Checker<'a> {
         self.centres.truncate(kept.len());
     }
 
-    /// The same beside the balls of a cloud in the world frame, too.
+    /// The same checker with a point cloud in the world frame.
     pub fn beside(self, cloud: Option<Arc<Cloud>>) -> Checker<'a> {
         Checker { cloud, ..self }
     }
 
-    /// The links of the robot, and what it holds.
+    /// Adds the links of the robot, and what it holds.
     fn add_arm(&mut self, arm: &Mechanism) {
         let (hand, own) = (self.robot.hand(), self.robot.model.links.len());
         for (i, link) in arm.links.iter().enumerate() {
@@ -268,7 +268,7 @@ impl<'a> Checker<'a> {
                 solid: Solid::primitive(body, 0.0),
                 padded: Solid::primitive(body, self.padding),
                 middle: Vector::ZERO,
-                // A padded box's corners move out by more than the padding.
+                // The corners of a padded box move out by more than the padding.
                 reach: [body.geometry.radius(), self.padding * 3_f64.sqrt()],
             });
             let meshes = link.meshes.iter().map(|meshed| {
@@ -289,10 +289,10 @@ impl<'a> Checker<'a> {
         }
     }
 
-    /// What stands in the scene.
+    /// Adds the scene's objects that are not held.
     fn add_scene(&mut self, scene: &Scene) {
         for object in &scene.objects {
-            // What is in the gripper has been added with the arm; `hands` says where the rest is.
+            // Held objects have been added with the arm; `hands` has the poses of the others.
             if let Placement::World(pose) = &object.placement {
                 let part = Part::standing(&Geometry::from(&object.shape));
                 self.add_obstacle(object.name.clone(), None, pose.compose(&part.at), part, Entry::Pressed);
@@ -318,7 +318,7 @@ impl<'a> Checker<'a> {
         self.obstacles.push(Obstacle { name, link, solid, pose, centre, radius, entry });
     }
 
-    /// Which pairs are to be kept apart: the arm says so of its links, and everything of the arm is to be kept from the objects.
+    /// Finds the pairs that are to be kept apart: between links as the arm defines, and between every moving part of the arm and the objects.
     fn find_pairs(&mut self, arm: &Mechanism) {
         let carriers = arm.carriers();
         let is_looked_at =
@@ -340,7 +340,7 @@ impl<'a> Checker<'a> {
         self.reach = self.farthest(robot.arm_joints(), |link| robot.arm_chain(&at, link));
     }
 
-    /// The farthest that any of the shapes moves with these joints, or that two of a pair move towards each other.
+    /// Maximum motion of any moving shape, or of two shapes of a pair towards each other, per joint.
     fn farthest(&self, joints: &[Joint], chain_to: impl Fn(usize) -> Chain) -> JointVector {
         let levers_of = |moving: &Moving| {
             let chain = chain_to(moving.frame);
@@ -354,7 +354,7 @@ impl<'a> Checker<'a> {
         let towards_each_other = self.pairs.iter().filter_map(|(i, j)| {
             let ((chain, levers), (other, other_levers)) = (&all[*i], &all[*j]);
             let shared = chain.shared_with(other);
-            // Where one chain goes on from the end of the other, it alone moves.
+            // If one chain continues the other, only the longer one moves relative to the other.
             let branches = shared < chain.joints.len().min(other.joints.len());
             let [a, b] = [levers, other_levers].map(|levers| levers.behind(shared).per_joint(joints.len()));
             branches.then(|| JointVector::from_fn(joints.len(), |j| a[j] + b[j]))
@@ -363,7 +363,8 @@ impl<'a> Checker<'a> {
         alone.chain(towards_each_other).fold(JointVector::zeros(joints.len()), greater)
     }
 
-    /// The links that are kept apart, by their indices in the arm with what it holds ([`arm::holding`](crate::arm::holding)), the lower first.
+    /// The pairs of links that are kept apart, by their indices in the arm with what it holds ([`arm::holding`](crate::arm::holding)), the lower
+    /// first.
     pub fn pairs(&self) -> BTreeSet<(usize, usize)> {
         let beside = self.moving.iter().flat_map(|moving| {
             let links = moving.obstacles.iter().filter_map(|o| self.obstacles[*o].link);
@@ -378,20 +379,20 @@ impl<'a> Checker<'a> {
         self.robot
     }
 
-    /// How much room it keeps around the moving shapes, in metres.
+    /// The padding around the moving shapes, in metres.
     pub fn padding(&self) -> f64 {
         self.padding
     }
 
-    /// Into how many equal steps the straight line between two postures must be cut so that in one no point of the robot moves further than
-    /// twice the padding, and no two shapes come nearer to each other by more than that.
+    /// Number of equal steps into which the straight line between two postures must be cut so that in one step no point of the robot moves further
+    /// than twice the padding, and no two shapes approach each other by more than that.
     pub fn steps(&self, from: &JointVector, to: &JointVector) -> usize {
         let moved: f64 = (0..self.reach.len()).map(|j| (to[j] - from[j]).abs() * self.reach[j]).sum();
         let step = if self.padding > 0.0 { 2.0 * self.padding } else { UNPADDED_STEP_M };
         ((moved / step).ceil() as usize).max(1)
     }
 
-    /// The same but for two shapes that meet, by their names: they may.
+    /// The same checker without one pair of shapes, given by their names: these two may touch.
     pub(crate) fn but_for(mut self, met: &Collision) -> Checker<'a> {
         let is_met = |a: &str, b: &str| [[a, b], [b, a]].contains(&[&*met.moving, &*met.other]);
         let (moving, obstacles) = (&mut self.moving, &self.obstacles);
@@ -403,7 +404,7 @@ impl<'a> Checker<'a> {
         self
     }
 
-    /// From now on each finger is so far from the middle, in metres.
+    /// Sets the position of each finger, in metres from the middle.
     pub(crate) fn set_finger(&mut self, finger: f64) {
         if self.configuration.finger != finger {
             self.configuration.finger = finger;
@@ -411,19 +412,19 @@ impl<'a> Checker<'a> {
         }
     }
 
-    /// How far any point of the fingers moves, or two of them move towards each other, at the most when each goes so far, in metres.
+    /// Maximum motion of any point of the fingers, or of two of their shapes towards each other, when each finger moves by `by` metres.
     pub(crate) fn fingers_move_m(&self, by: f64) -> f64 {
         let farthest =
             self.farthest(self.robot.finger_joints(), |link| self.robot.finger_chain(&self.configuration, link));
         farthest.iter().map(|reach| reach * by.abs()).sum()
     }
 
-    /// Whether a posture touches nothing.
+    /// Whether a posture is free of collisions.
     pub fn is_free(&mut self, arm: &JointVector, contact: Contact) -> bool {
         self.hit(arm, contact).is_none()
     }
 
-    /// What a posture touches first, if anything.
+    /// The first collision found in a posture, if any.
     pub fn collision(&mut self, arm: &JointVector, contact: Contact) -> Option<Collision> {
         let (i, other) = self.hit(arm, contact)?;
         let depth_m = self.depth(i, other).unwrap_or(-self.padding);
@@ -436,20 +437,18 @@ impl<'a> Checker<'a> {
         Some(Collision { moving, other, depth_m, padding_m })
     }
 
-    /// Whether something meets what stands that moves with the tool alone: then every posture of that pose of the tool does.
+    /// Whether a collision is between an obstacle and something that is fixed to the tool: then every posture with that pose of the tool has it.
     pub(crate) fn is_of_the_tool(&self, collision: &Collision) -> bool {
         self.moving.iter().any(|moving| moving.is_with_tool && moving.name == collision.moving)
             && self.obstacles.iter().any(|obstacle| obstacle.name == collision.other)
     }
 
-    /// How far any point of the robot moves, or two of its shapes move towards each other, at the most when the joints move by so much, in
-    /// metres.
+    /// Maximum motion of any point of the robot, or of two of its shapes towards each other, when the joints move by `turns`, in metres.
     pub(crate) fn moves_m(&self, turns: &JointVector) -> f64 {
         (0..self.reach.len()).map(|j| turns[j].abs() * self.reach[j]).sum()
     }
 
-    /// How far a posture is from touching what it may not, in metres, or `up_to` where that is less; or what it touches. For a checker
-    /// without padding.
+    /// Distance of a posture from the next forbidden contact, in metres, at most `up_to`; or the collision. For a checker without padding.
     pub(crate) fn room(&mut self, arm: &JointVector, contact: Contact, up_to: f64) -> Result<f64, Collision> {
         if let Some(collision) = self.collision(arm, contact) {
             return Err(collision);
@@ -470,7 +469,7 @@ impl<'a> Checker<'a> {
         Ok(room)
     }
 
-    /// The same of one pair that does not touch, in the posture checked last; `up_to` if there is more.
+    /// As `room`, for one pair that does not touch, in the posture checked last.
     fn room_between(&self, i: usize, other: Other, contact: Contact, up_to: f64) -> f64 {
         let moving = &self.moving[i];
         let (centre, radius) = match other {
@@ -492,12 +491,12 @@ impl<'a> Checker<'a> {
         (apart + tolerance).clamp(0.0, up_to)
     }
 
-    /// Whether the straight motion from one posture to another touches nothing; `from` itself is not checked.
+    /// Whether the straight motion between two postures is free of collisions; `from` itself is not checked.
     pub fn edge_is_free(&mut self, from: &JointVector, to: &JointVector, contact: Contact) -> bool {
         if !self.is_free(to, contact) {
             return false;
         }
-        // Halving: the middle of an edge is where it most likely touches something.
+        // Bisection: an edge is most likely in collision at its middle.
         let steps = self.steps(from, to);
         let mut stride = steps.next_power_of_two();
         while stride > 1 {
@@ -517,7 +516,7 @@ impl<'a> Checker<'a> {
         (0..=steps).find_map(|i| self.collision(&between(from, to, i as f64 / steps as f64), contact))
     }
 
-    /// Brings the arm to a posture.
+    /// Sets the posture of the arm.
     fn place(&mut self, arm: &JointVector) {
         self.configuration.arm = *arm;
         self.robot.update_arm(&self.configuration, &mut self.poses);
@@ -530,7 +529,7 @@ impl<'a> Checker<'a> {
 
     fn hit(&mut self, arm: &JointVector, contact: Contact) -> Option<(usize, Other)> {
         self.place(arm);
-        // The hand and what it holds are the likeliest to touch something.
+        // The hand and what it holds are the most likely to collide.
         for i in (0..self.moving.len()).rev() {
             let moving = &self.moving[i];
             for &o in &moving.obstacles {
@@ -573,7 +572,7 @@ impl<'a> Checker<'a> {
         self.can_press(i) && self.depth(i, other).is_some_and(|depth| depth <= deepest)
     }
 
-    /// What may be in this where contact is allowed.
+    /// What may penetrate this obstacle where contact is allowed.
     fn entry(&self, other: Other) -> Entry {
         match other {
             Other::Obstacle(o) => self.obstacles[o].entry,
@@ -581,12 +580,12 @@ impl<'a> Checker<'a> {
         }
     }
 
-    /// Whether a moving shape may touch something at all.
+    /// Whether a moving shape may touch anything at all.
     fn can_press(&self, i: usize) -> bool {
         matches!(self.moving[i].role, Role::Finger | Role::Held)
     }
 
-    /// How deep a moving shape may be in this, in metres.
+    /// Allowed penetration of a moving shape into another one, in metres.
     fn may_press(&self, i: usize, other: Other, contact: Contact) -> f64 {
         match contact {
             Contact::Gripper(press) if self.can_press(i) && self.entry(other) == Entry::Never => press.min(0.0),
@@ -595,8 +594,8 @@ impl<'a> Checker<'a> {
         }
     }
 
-    /// How far a moving shape, unpadded, is from the next ball of the cloud in the posture checked last, in metres, or `up_to` where that is
-    /// less; negative: how deep one is in the other.
+    /// Distance of an unpadded moving shape from the nearest ball of the cloud in the posture checked last, in metres, at most `up_to`. Negative:
+    /// the penetration.
     fn gap_to_cloud(&self, i: usize, up_to: f64) -> f64 {
         let Some(cloud) = &self.cloud else { return up_to };
         let (pose, Solid { shape, inside, .. }) = (&self.placed[i], &self.moving[i].solid);
@@ -609,7 +608,7 @@ impl<'a> Checker<'a> {
         gap
     }
 
-    /// How deep the unpadded shapes are inside each other, in metres, in the posture checked last.
+    /// Penetration of the unpadded shapes in the posture checked last, in metres.
     fn depth(&self, i: usize, other: Other) -> Option<f64> {
         let near = 2.0 * self.padding;
         let apart = match other {
@@ -619,15 +618,15 @@ impl<'a> Checker<'a> {
         (apart <= near).then_some(-apart)
     }
 
-    /// A moving shape as it is checked beside something, which may be of a link: with the padding, except beside links that may be built to run closer
-    /// to its own than that.
+    /// A moving shape as it is checked against another one, which belongs to `link` if given: padded, except against links that may be built to
+    /// run closer to its own link than the padding.
     fn grown(&self, i: usize, link: Option<usize>) -> Placed<'_> {
         let moving = &self.moving[i];
         let is_close = link.is_some_and(|link| self.close.contains(&(link.min(moving.link), link.max(moving.link))));
         Placed { pose: self.placed[i], solid: if is_close { &moving.solid } else { &moving.padded } }
     }
 
-    /// How far the unpadded shapes are from each other, in metres, or more than `enough_m`; below zero as far as they are deep in each other.
+    /// Distance of the unpadded shapes in metres, or any value greater than `enough_m` if it is more than that. Negative: the penetration.
     fn apart_m(&self, i: usize, other: Other, enough_m: f64) -> f64 {
         let (pose, solid) = match other {
             Other::Obstacle(o) => (self.obstacles[o].pose, &self.obstacles[o].solid),
@@ -640,7 +639,7 @@ impl<'a> Checker<'a> {
 }
 
 impl Part {
-    /// What stands, with its axis along z.
+    /// A shape that does not move, with its axis along z.
     fn standing(geometry: &Geometry) -> Part {
         let body = geometry.at(Pose::IDENTITY);
         let solid = || Solid::primitive(&body, 0.0);
@@ -675,7 +674,7 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
 
-    /// A robot whose arm is moved by `a` and then `b`, with what a URDF says between and behind them.
+    /// A robot whose arm has the joints `a` and then `b`; the URDF in `joints` has what is between and behind them.
     fn robot(joints: &str, arm: &str, tool: &str) -> Robot {
         let toml = format!("name = 'r'\nurdf = 'r'\n[arm]\njoints = [{arm}]\ntool = '{tool}'\n");
         let description = crate::description::RobotDescription::read(&toml).unwrap();

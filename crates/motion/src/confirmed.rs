@@ -1,8 +1,9 @@
-//! What the search tells apart by exact shapes: couples of which spheres say something wrong in a problem.
+//! Couples that the search checks by exact shapes, because their spheres collide in the problem though the shapes do not.
 //!
-//! The search sees spheres that hold the shapes. Where they touch in the start or the goal and the shapes do not, there would be no search at all. So
-//! these couples, of two links or of a link and what stands around, are left out of the vector checks and looked at here, from posture to posture, after
-//! everything else was found free. That is slow, and needed for few couples of few problems. The finished path is checked by the exact shapes anyway.
+//! The search uses spheres that hold the shapes. If spheres touched in the start or the goal where the shapes do not, there could be no search at
+//! all. So these couples, of two links or of a link and an obstacle, are left out of the vector checks and are checked here, from posture to
+//! posture, after all other checks have passed. That is slow, and needed for few couples of few problems. The finished path is checked by the
+//! exact shapes anyway.
 
 use crate::cloud::Cloud;
 use crate::exact::{self, Exact, Other, Shape};
@@ -15,16 +16,16 @@ use ratn_model::pose::Pose;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Couples of things that are to be kept apart.
+/// Couples that are to be kept apart.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Couples {
-    /// Links, the lower index first.
+    /// Pairs of links, the lower index first.
     pub(crate) pairs: BTreeSet<Pair>,
-    /// Links, and the name of what stands around.
+    /// A link and the name of an obstacle.
     pub(crate) beside: BTreeSet<(usize, String)>,
 }
 
-/// Couples that are kept apart by their exact shapes.
+/// Couples that are checked by their exact shapes.
 #[derive(Debug, Clone)]
 pub(crate) struct Confirmed {
     mechanism: Mechanism,
@@ -44,7 +45,7 @@ enum Against {
     Cloud(Arc<Cloud>),
 }
 
-/// A shape in a sphere.
+/// A shape in its bounding sphere.
 #[derive(Debug, Clone)]
 struct Bounded {
     shape: Shape,
@@ -52,7 +53,7 @@ struct Bounded {
     radius: f32,
 }
 
-/// Two things that meet.
+/// A couple that collides.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Met {
     Pair(Pair),
@@ -60,7 +61,7 @@ pub(crate) enum Met {
 }
 
 impl Couples {
-    /// All that meets in a posture.
+    /// All couples that collide in a posture.
     pub(crate) fn met(exact: &Exact<'_>, positions: &[f64]) -> Couples {
         let mut met = Couples::default();
         exact.visit(positions, &mut |link, other, _| {
@@ -87,12 +88,12 @@ impl Couples {
         }
     }
 
-    /// Shows each of them.
+    /// Calls `see` with each couple.
     pub(crate) fn into_each(self, see: &mut dyn FnMut(Met)) {
         self.pairs.into_iter().map(Met::Pair).chain(self.beside.into_iter().map(Met::Beside)).for_each(see);
     }
 
-    /// Takes others, too, and says whether there were any that are new.
+    /// Adds other couples; returns whether any of them is new.
     pub(crate) fn extend(&mut self, others: Couples) -> bool {
         let before = (self.pairs.len(), self.beside.len());
         self.pairs.extend(others.pairs);
@@ -104,7 +105,7 @@ impl Couples {
         self.pairs.is_empty() && self.beside.is_empty()
     }
 
-    /// The robot without these checks.
+    /// The mechanism without the checks of these couples.
     pub(crate) fn left_out_of(&self, mechanism: &Mechanism) -> Mechanism {
         let mut left = mechanism.clone();
         left.by_shapes.extend(&self.pairs);
@@ -114,7 +115,7 @@ impl Couples {
 }
 
 impl Confirmed {
-    /// These couples of a robot and what stands around it, which keeps `room_m` metres more from the robot.
+    /// The check of these couples, with `room_m` metres more distance from the obstacles.
     pub(crate) fn new(
         mechanism: &Mechanism,
         surroundings: Surroundings<'_>,
@@ -148,7 +149,7 @@ impl Confirmed {
         Confirmed { mechanism: mechanism.clone(), couples: confirmed }
     }
 
-    /// Whether they are apart in a posture.
+    /// Whether none of the couples collides in a posture.
     pub(crate) fn is_free(&self, state: &State) -> bool {
         let positions: Vec<f64> =
             state[..self.mechanism.joints.len()].iter().map(|position| f64::from(*position)).collect();
@@ -156,25 +157,25 @@ impl Confirmed {
         !self.couples.iter().any(|couple| couple.meets(&poses))
     }
 
-    /// Of some of them those that are apart in a posture.
+    /// The couples in `among` that do not collide in a posture.
     pub(crate) fn apart(&self, among: &Couples, positions: &[f64]) -> Couples {
         let poses = self.mechanism.poses(positions);
         let (mut apart, mut met) = (Couples::default(), Couples::default());
         for couple in self.couples.iter().filter(|couple| among.contains(&couple.is)) {
             if couple.meets(&poses) { &mut met } else { &mut apart }.insert(couple.is.clone());
         }
-        // What stands around under one name may be several things.
+        // Several obstacles may have the same name.
         apart.pairs.retain(|pair| !met.pairs.contains(pair));
         apart.beside.retain(|beside| !met.beside.contains(beside));
         apart
     }
 
-    /// Whether they are apart on a straight motion cut into so many steps; `from` itself is not looked at.
+    /// Whether no couple collides on a straight motion cut into `steps` steps; `from` itself is not checked.
     pub(crate) fn is_free_motion(&self, from: &State, to: &State, steps: usize) -> bool {
         if !self.is_free(to) {
             return false;
         }
-        // Halving: what is between is found early.
+        // Bisection finds a collision in the middle early.
         let mut stride = steps.next_power_of_two();
         while stride > 1 {
             for i in (stride / 2..steps).step_by(stride) {

@@ -1,8 +1,7 @@
-//! RRT-Connect: two trees, one from the start and one from the goals, each growing towards samples and then towards the other
-//! (Kuffner and LaValle, ICRA 2000), with the trees kept balanced (Kuffner and LaValle 2005) and nodes that only take samples
-//! near them once an extension failed (dynamic domain, Yershova et al., ICRA 2005), and make shorter motions now and then. A tree most of whose
-//! extensions fail goes on where one does not and comes nearer to the other tree. A robot with several
-//! arms moves one after the other first (`branches`).
+//! RRT-Connect: two trees, one from the start and one from the goals, each growing towards samples and then towards the other (Kuffner and
+//! LaValle, ICRA 2000). The trees are kept balanced (Kuffner and LaValle 2005). Nodes that failed to extend take only samples near them (dynamic
+//! domain, Yershova et al., ICRA 2005) and make shorter motions now and then. If most extensions of a tree fail, an extension that succeeds goes
+//! on as long as it comes nearer to the other tree. A robot with several arms moves one after the other first (`branches`).
 //!
 //! The same space, ends, seed and budget give the same path. The caller is asked every `POLL` iterations whether to go on.
 
@@ -19,70 +18,70 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::cell::Cell;
 
-/// How far a tree grows at once, as a part of what two random postures differ by in a joint (in the root mean square), attempt by attempt:
-/// a search that does not end is begun anew, with shorter and longer motions in turn. For a Panda they are 1.0 and 0.5 radians.
+/// Maximum length of an extension per attempt, as a fraction of the root-mean-square difference per joint of two random postures. A search that
+/// does not end is restarted with the next value, shorter and longer in turn. For a Panda the two are 1.0 and 0.5 radians.
 const RANGES: [f32; 2] = [0.5, 0.25];
 
-/// Samples of the first attempt; each further one has four times as many.
+/// Samples of the first attempt; each further attempt has four times as many.
 const FIRST_ATTEMPT: usize = 131_072;
 
-/// As many for each branch of a robot that has several.
+/// Samples of the first attempt for each branch of a robot that has several.
 const IN_TURN: usize = 4096;
 
-/// The dynamic domain: where it begins after a failure, as a part of how far apart two random postures are (in the root mean square over all
-/// joints together: postures of more joints are further apart, and a ball about a node is to hold a similar part of the samples), its least size as
-/// a part of the range of the first attempt, and how fast it changes. It does not shrink with the range of an attempt: half of the radius of a ball
-/// holds one of 2^joints of its samples.
+/// The dynamic domain: its radius after a failure, as a fraction of the root-mean-square distance of two random postures over all joints together
+/// (postures of more joints are further apart, and the ball around a node is to hold a similar share of the samples); its minimum, as a fraction
+/// of the range of the first attempt; and how fast it changes. It does not shrink with the range of an attempt: a ball of half the radius holds
+/// only one of 2^joints of its samples.
 const DOMAIN: f32 = 0.64;
 const LEAST_DOMAIN: f32 = 1.0;
 const DOMAIN_CHANGE: f32 = 1e-4;
 
-/// A tree grows until the other has less than this part of its nodes; then the other one grows. Where trees take turns at every sample until one is
-/// twice as large, a shut-in tree gets half of the samples that it needs. From 0.3 to 0.8 the times differ little.
+/// A tree grows until the other has less than this fraction of its nodes; then the other one grows. If trees took turns at every sample until one
+/// is twice as large, a shut-in tree would get half of the samples that it needs. From 0.3 to 0.8 the times differ little.
 const BALANCE: f32 = 0.67;
 
-/// A tree is shut in where so many times as many of its motions failed as it has nodes. Its motions are then looked at several at once
-/// ([`Ahead`]). What gets out goes on towards its sample, as long as the way is free and nearer to the other tree than before: the next motion
-/// out would take as many attempts. Elsewhere that finds little, and makes paths longer.
+/// A tree is shut in if the number of its failed motions is this many times the number of its nodes. Its motions are then checked several at once
+/// ([`Ahead`]). A motion that succeeds goes on towards its sample as long as the way is free and comes nearer to the other tree: the next success
+/// would take as many attempts. For other trees that finds little, and makes paths longer.
 const SHUT_IN: usize = 8;
 
-/// After so many samples, each so many extensions of nodes that have failed before one is shorter, by this factor: what is shut in finds its way
-/// out by short motions, which elsewhere only take time.
+/// After `SHORT_FROM` samples, one in `SHORT_EVERY` extensions of nodes that have failed before is shorter, by the factor below: a shut-in tree
+/// gets out by short motions, which only cost time elsewhere.
 const SHORT_FROM: usize = 4096;
 const SHORT_EVERY: usize = 4;
 const SHORT: f32 = 0.5;
 
-/// Iterations between two questions to the caller: some tens of microseconds.
+/// Iterations between two calls of the caller's `control`: some tens of microseconds.
 const POLL: usize = 32;
 
-/// Postures looked for per target, and attempts at them.
+/// Postures searched per target, and attempts to find them.
 const POSTURES: usize = 8;
 const ATTEMPTS: usize = 24;
 
-/// Samples drawn at most to mend one motion, how much longer than it a detour through the first of them may be, in radians, and
-/// after how many that doubles: the last are from everywhere.
+/// For mending one motion: the maximum number of samples; how much longer than the motion a detour through the first samples may be, in radians;
+/// and the number of samples after which that doubles, so that the last samples come from everywhere.
 const MENDING_ITERATIONS: usize = 512;
 const FIRST_DETOUR: f32 = 0.1;
 const DETOUR_DOUBLES: usize = 64;
 
-/// How often a path with a gap between its postures is mended before the search gives up.
+/// How often a path whose motions are not free is mended before the search gives up.
 const MENDINGS: usize = 16;
 
-/// What the search may cost.
+/// Limits of a search.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Budget {
-    /// Samples drawn at most.
+    /// Maximum number of samples.
     pub iterations: usize,
-    /// Of the samples.
+    /// Seed of the samples.
     pub seed: u64,
 }
 
 /// A free path.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Route {
-    /// From the start to a goal.
+    /// Postures from the start to a goal.
     pub path: Vec<State>,
-    /// Which goal.
+    /// Index of the goal.
     pub goal: usize,
     /// Samples drawn.
     pub iterations: usize,
@@ -91,16 +90,16 @@ pub struct Route {
 /// Why there is no path.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ConnectError {
-    /// The start touches something or is out of the limits.
+    /// The start is in collision or outside the limits.
     #[error("the start is not free")]
     Start,
-    /// So do all goals.
+    /// All goals are in collision or outside the limits.
     #[error("none of the {goals} goals is free")]
     Goal {
         /// How many there are.
         goals: usize,
     },
-    /// A posture breaks the constraint that the whole path is to keep.
+    /// A posture violates the constraint of the whole path.
     #[error("the {which} does not keep the constraint of the path")]
     Constraint {
         /// Start, or every free goal.
@@ -155,7 +154,7 @@ pub fn connect(
     Ok(Route { path, goal, iterations })
 }
 
-/// Searches with the branches of the robot in turn, where it has several, and with all joints, with more samples each time.
+/// Searches the branches of the robot in turn, if it has several, and then all joints, with more samples each time.
 fn search(
     space: &mut Space,
     start: &State,
@@ -192,7 +191,7 @@ fn search(
     Err(ConnectError::Exhausted { iterations: used.get() })
 }
 
-/// One branch after the other.
+/// Searches one branch after the other.
 fn in_turn(
     space: &mut Space,
     start: &State,
@@ -227,7 +226,7 @@ fn in_turn(
     Ok((together(space, &paths), used))
 }
 
-/// As [`grow`], towards samples in which only some of the joints move.
+/// As [`grow`], with samples in which only some of the joints move.
 fn grow_with(
     space: &mut Space,
     start: &State,
@@ -245,14 +244,14 @@ fn grow_with(
     };
     let found = grow_by(space, start, ends, (iterations, range), sample, control);
     if let Ok((_, used)) = &found {
-        // The others were drawn ahead; the next arm begins with them.
+        // The unused samples were drawn ahead; the next branch begins with them.
         samples.take_back(drawn - used);
     }
     found
 }
 
-/// Searches a path from `start` to a posture that meets one of `targets`: several postures for each, all of them roots of one
-/// search. The route's `goal` is the index of the target.
+/// Searches a path from `start` to a posture that meets one of `targets`: several postures for each, all of them roots of one search. The route's
+/// `goal` is the index of the target.
 ///
 /// # Errors
 /// As [`connect`]; [`ConnectError::Goal`] also where no posture meets a target.
@@ -281,7 +280,7 @@ pub fn connect_to_targets(
     Ok(Route { goal: goals[route.goal].0, ..route })
 }
 
-/// What the caller's answer means for the search.
+/// Turns the caller's answer into the result of the search.
 fn go_on(control: &mut dyn FnMut(usize) -> Control, iterations: usize) -> Result<(), ConnectError> {
     match control(iterations) {
         Control::Continue | Control::Settle => Ok(()),
@@ -290,8 +289,7 @@ fn go_on(control: &mut dyn FnMut(usize) -> Control, iterations: usize) -> Result
     }
 }
 
-/// Makes sure that a path whose postures are free is free also between them: for motions that are not, a detour is
-/// searched, near them first.
+/// Makes sure that a path with free postures is also free between them: for motions that are not, a detour is searched, close to them first.
 ///
 /// # Errors
 /// [`ConnectError::Exhausted`] where a motion cannot be mended, [`ConnectError::TimeUp`] and [`ConnectError::Cancelled`].
@@ -319,7 +317,7 @@ pub fn mend(
     Ok(whole)
 }
 
-/// A way free between its postures that is little longer than the straight motion, where there is one.
+/// A path with free motions that is little longer than the straight motion, if there is one.
 fn detour(
     space: &mut Space,
     from: &State,
@@ -341,15 +339,15 @@ fn detour(
     found.map(|(path, _)| path)
 }
 
-/// How far a tree of this robot grows at once, for a part of [`RANGES`].
+/// Maximum length of an extension for this robot, for a fraction of [`RANGES`].
 fn range(space: &Space, part: f32) -> f32 {
     let (lower, upper) = space.limits();
-    // Two even samples of a range differ by its sixth in the mean square.
+    // The mean squared difference of two uniform samples is a sixth of the squared range.
     let squares: f32 = difference(upper, lower).iter().map(|range| range * range / 6.0).sum();
     part * (squares / space.joints().max(1) as f32).sqrt()
 }
 
-/// As [`grow_by`], by the range of a first attempt.
+/// As [`grow_by`], with the range of the first attempt.
 pub(crate) fn grow(
     space: &mut Space,
     start: &State,
@@ -362,15 +360,15 @@ pub(crate) fn grow(
     grow_by(space, start, ends, (iterations, range), sample, control)
 }
 
-/// What came of growing towards another tree.
+/// Result of growing a tree towards the other one.
 struct Joining {
-    /// How far the trees were apart.
+    /// Distance between the trees.
     gap: f32,
-    /// The last new node and the one of the other tree that it is next to, where the way between them is free.
+    /// The last new node and the node of the other tree next to it, if the motion between them is free.
     met: Option<(usize, usize)>,
 }
 
-/// Grows a tree from a node towards the nearest one of another, as far as the way is free.
+/// Grows a tree from a node towards the nearest node of the other tree, as far as the way is free.
 fn join(space: &mut Space, tree: &mut Tree, other: &Tree, mut node: usize, range: f32) -> Joining {
     let from = tree.states[node];
     let (meeting, gap) = other.nearest(&from);
@@ -390,7 +388,7 @@ fn join(space: &mut Space, tree: &mut Tree, other: &Tree, mut node: usize, range
     Joining { gap, met: Some((node, meeting)) }
 }
 
-/// Grows a tree from the start and one from all ends, which are free, until they meet; gives the path and the iterations.
+/// Grows a tree from the start and one from all ends, which are free, until they meet. Returns the path and the number of iterations.
 fn grow_by(
     space: &mut Space,
     start: &State,
@@ -408,7 +406,7 @@ fn grow_by(
     let first_range = self::range(space, RANGES[0]);
     let apart = self::range(space, 1.0) * (joints as f32).sqrt();
     let (domain, least_domain) = (DOMAIN * apart, LEAST_DOMAIN * first_range);
-    // Which tree grows towards the sample, and how many of its motions failed.
+    // Index of the tree that grows towards the sample, and the number of failed motions per tree.
     let (mut growing, mut failed) = (1, [0, 0]);
     let is_shut_in = |failed: usize, tree: &Tree| failed >= SHUT_IN * tree.len();
     let step = |iteration: usize, radius: f32| {
@@ -416,7 +414,7 @@ fn grow_by(
         if may_be_short && radius.is_finite() { SHORT * range } else { range }
     };
     let mut ahead = Ahead::new(sample);
-    // Where nothing may be left between postures, an iteration takes as long as many others.
+    // If motions have to be free between their postures, an iteration takes as long as many others.
     let poll = if space.is_swept() { 1 } else { POLL };
     for iteration in 1..=iterations {
         if iteration % poll == 0 {
@@ -429,7 +427,7 @@ fn grow_by(
         let (first, second) = trees.split_at_mut(1);
         let (tree, other) = if growing == 0 { (&mut first[0], &second[0]) } else { (&mut second[0], &first[0]) };
         if is_shut_in(failed[growing], tree) && !ahead.knows_next(growing) {
-            // A search that has failed so often is likely to go on as long.
+            // A search that has failed this often is likely to fail as often again.
             let wanted = failed[growing].min(iterations - iteration + 1);
             ahead.look(space, (growing, tree), wanted, |after, radius| step(iteration + after, radius));
         }
@@ -453,7 +451,7 @@ fn grow_by(
         if tree.radii[near].is_finite() {
             tree.radii[near] *= 1.0 + DOMAIN_CHANGE;
         }
-        // No gap is less than none.
+        // Zero makes no gap small enough.
         let mut least_gap = if is_shut_in(failed[growing], tree) { other.nearest(&from).1 } else { 0.0 };
         let joined = loop {
             let joining = join(space, tree, other, node, range);

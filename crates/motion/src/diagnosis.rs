@@ -1,6 +1,7 @@
-//! What is wrong with the start or the goal of a problem, for people: joints beyond their range, and what touches what, how deep.
+//! Diagnosis of an invalid start or goal, for people: joints outside their limits, and what touches what, how deep.
 //!
-//! The exact shapes are asked first. The search sees spheres that hold them, so it may find touching what is not: then those spheres are asked.
+//! The exact shapes are checked first. The search uses spheres that hold them and may report contacts that the shapes do not have: in that case
+//! the spheres are checked.
 
 use crate::confirmed::{Confirmed, Couples, Met};
 use crate::exact::{Exact, Touch};
@@ -18,11 +19,11 @@ use ratn_model::pose::Pose;
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
-/// Postures drawn for what is in the way, and what is named of it at the most.
+/// Random postures drawn to find obstructions, and the maximum number of obstructions named.
 const DRAWN: usize = 100;
 const NAMED: usize = 3;
 
-/// What a posture breaks; `which` of the problem's ends it is begins each line.
+/// The rules that a posture breaks. Each line begins with `which`, the end of the problem that it is (start or goal).
 pub(crate) fn diagnosis(mechanism: &Mechanism, problem: &Problem, positions: &[f64], which: &str) -> Vec<String> {
     let beyond = mechanism.joints.iter().zip(positions).filter(|(j, q)| !j.allows(**q, 0.0));
     let limits = beyond.map(|(joint, position)| {
@@ -47,7 +48,7 @@ fn names(mechanism: &Mechanism, (a, b): Pair) -> [&str; 2] {
     [&mechanism.links[a].name, &mechanism.links[b].name]
 }
 
-/// What to do about two links that meet in every posture of the planned joints.
+/// Advice for two links that collide in every posture of the planned joints.
 pub(crate) fn no_joint_parts([a, b]: [&str; 2]) -> String {
     format!(
         "and no planned joint parts the two: put the joints that are not planned for elsewhere, or, if the two are made to touch, say so in the \
@@ -56,27 +57,27 @@ pub(crate) fn no_joint_parts([a, b]: [&str; 2]) -> String {
     )
 }
 
-/// What an SRDF says of two links that are not to be checked.
+/// The SRDF element that excepts a pair of links from the checks.
 pub(crate) fn exception(a: &str, b: &str, reason: &str) -> String {
     format!("<disable_collisions link1=\"{a}\" link2=\"{b}\" reason=\"{reason}\"/>")
 }
 
-/// What is in the way of a search that found no path.
+/// The obstructions found after a search without a path.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Blocked {
-    /// For people.
+    /// Messages for people.
     pub(crate) lines: Vec<String>,
-    /// Pairs whose spheres meet in many postures though the shapes do not.
+    /// Couples whose spheres collide in many postures though the shapes do not.
     pub(crate) doubts: Couples,
 }
 
-/// Looks at the straight way, and at postures drawn from all of the planned joints.
+/// Checks the straight way, and postures drawn from the ranges of all planned joints.
 pub(crate) fn blocked(mechanism: &Mechanism, problem: &Problem, ends: [&[f64]; 2]) -> Blocked {
     let exact = Exact::new(mechanism, problem.surroundings());
     let mut lines = Vec::new();
     let straight = exact.touch_along(&ends.map(<[f64]>::to_vec), Space::RESOLUTION.into());
     lines.extend(straight.map(|touch| format!("on the straight way {touch}")));
-    // In how many postures each thing meets another by the shapes, and in how many two links do by their spheres.
+    // Per couple: the number of postures in which its shapes collide, and in which only the spheres of two links do.
     let mut met: BTreeMap<Met, [usize; 2]> = BTreeMap::new();
     let (around, mut random) = (pairs::around(mechanism), ChaCha8Rng::seed_from_u64(1));
     let searched: Vec<Pair> =
@@ -112,12 +113,12 @@ pub(crate) fn blocked(mechanism: &Mechanism, problem: &Problem, ends: [&[f64]; 2
     Blocked { lines, doubts }
 }
 
-/// How much larger the search takes the meshes that stand around, in metres.
+/// Enlargement of the obstacle meshes in the search, in metres.
 pub(crate) fn overhang_m(problem: &Problem) -> f64 {
     problem.meshes.iter().map(|mesh| mesh.overhang_m).fold(0.0, f64::max)
 }
 
-/// What the spheres touch in one of these postures though the shapes do not: that alone, and with as much as the search takes meshes larger.
+/// Couples whose spheres collide in one of these postures though the shapes do not: as they are, and with the enlargement of meshes in the search.
 pub(crate) fn doubts<'p>(
     mechanism: &Mechanism,
     problem: &Problem,
@@ -134,7 +135,7 @@ pub(crate) fn doubts<'p>(
     doubts
 }
 
-/// What the spheres of the robot touch; they alone, and with as much as the search takes meshes larger.
+/// Contacts of the robot's spheres: as they are, and with the enlargement of meshes in the search.
 fn by_spheres(mechanism: &Mechanism, problem: &Problem, positions: &[f64], which: &str) -> Vec<String> {
     let touches = [0.0, overhang_m(problem)].into_iter().find_map(|larger_m| {
         let touches = sphere_touches(mechanism, problem.surroundings(), positions, larger_m);
@@ -149,7 +150,7 @@ fn by_spheres(mechanism: &Mechanism, problem: &Problem, positions: &[f64], which
     }
 }
 
-/// What is too near for the search though it does not touch, and what to do; the first `own` links are those of the URDF.
+/// A contact that only the search sees, and advice. The first `own` links are those of the URDF.
 pub(crate) fn crowding(mechanism: &Mechanism, own: usize, Touch { link, other, depth_m }: &Touch) -> String {
     let index = |name: &str| mechanism.link(name);
     let is_own = |name: &str| index(name).is_some_and(|index| index < own);
@@ -166,7 +167,7 @@ pub(crate) fn crowding(mechanism: &Mechanism, own: usize, Touch { link, other, d
     )
 }
 
-/// What the spheres touch that the search takes for a robot, each so much larger, the deepest first.
+/// Contacts of the spheres that the search uses, each enlarged by `larger_m`, the deepest first.
 pub(crate) fn sphere_touches(
     mechanism: &Mechanism,
     surroundings: Surroundings<'_>,
@@ -177,7 +178,7 @@ pub(crate) fn sphere_touches(
     Exact::new(&coarse, surroundings).touches(positions)
 }
 
-/// A robot that has its spheres for shapes, each so much larger, in the checks of the search.
+/// A mechanism whose shapes are the spheres of the search, each enlarged by `larger_m` metres.
 pub(crate) fn of_spheres(mechanism: &Mechanism, larger_m: f64) -> Mechanism {
     let body = |Sphere { centre: [x, y, z], radius }: &Sphere| Body {
         pose: Pose::at(*x, *y, *z),

@@ -1,10 +1,10 @@
-//! How far two shapes are from each other: the one number that says whether they touch.
+//! Distance of two shapes: the one number that decides whether they touch.
 //!
-//! parry3d answers that three times (`intersection_test`, `distance`, `contact`), in `f32`, and the answers contradict each other. Beside
-//! cylinders and capsules they are off by up to a centimetre, to both sides: its search stops where rounding keeps it from a nearer point. So
-//! the search of Gilbert, Johnson and Keerthi (1988) is done here in `f64`. It goes on until a direction proves that the shapes are no nearer.
-//! Where it has to give up, they count as near as nothing disproves. Balls and capsules are a point and a segment with a radius, which is exact.
-//! Of a mesh the surface counts alone; the trees of parry3d find the triangles that matter: of two meshes both at once.
+//! parry3d answers that three times (`intersection_test`, `distance`, `contact`), in `f32`, and the answers contradict each other. For cylinders
+//! and capsules they are off by up to a centimetre, in both directions: its search stops where rounding keeps it from a nearer point. So the
+//! search of Gilbert, Johnson and Keerthi (GJK, 1988) is done here in `f64`. It goes on until a direction proves that the shapes are no nearer. If
+//! it has to give up, the result is the largest distance that is proven. Balls and capsules are a point and a segment with a radius, which is
+//! exact. Of a mesh only the surface counts; the trees of parry3d find the triangles that matter, for two meshes both at once.
 
 use crate::frame::{cross, difference, norm, rotate};
 use parry3d::bounding_volume::Aabb;
@@ -15,32 +15,32 @@ use parry3d::shape::{Shape, TriMesh};
 use ratn_model::pose::Pose;
 use std::cell::Cell;
 
-/// Steps of a search at the most. Shapes whose sizes differ by a hundred take forty.
+/// Maximum number of steps of a search. Shapes whose sizes differ by a factor of a hundred take forty.
 const MAX_STEPS: usize = 128;
 
-/// How far a distance may be off, in metres and as a part of it.
+/// Error of a distance: in metres, and as a fraction of it.
 const ROUNDED_M: f64 = 1e-7;
 const ROUNDED: f64 = 1e-6;
 
-/// What is this near is at the same place, in metres.
+/// Points nearer to each other than this count as the same, in metres.
 const SAME_M: f64 = 1e-10;
 
-/// How far off what parry3d takes for the distance of shapes that touch may be, in metres.
+/// Error of parry3d's distance for shapes that touch, in metres.
 const ROUGH_M: f32 = 0.02;
 
-/// Four corners whose volume is a smaller part of that of a box with their edges lie in a plane.
+/// Four corners lie in a plane if their volume is a smaller fraction than this of the volume of a box with their edges.
 const FLAT: f64 = 1e-12;
 
 type Point = [f64; 3];
 
-/// How far two shapes are from each other, in metres; something greater than `enough_m` where that is more than `enough_m`. Zero or less where
-/// they touch: then [`depth`] says how deep. `None` where it cannot be told.
+/// Distance of two shapes in metres, or any value greater than `enough_m` if it is more than that. Zero or less if they touch: then [`depth`]
+/// returns the penetration. `None` if it cannot be computed.
 pub fn gap(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape, enough_m: f64) -> Option<f64> {
     gap_in_first(&a_at.inv_mul(b_at), a, b, enough_m, &Cell::new(u32::MAX))
 }
 
-/// As [`gap`], with so many searches at the most: one for each two triangles, or a triangle and another shape, that are compared. Those that were made
-/// are taken off; where none is `left`, it could not be told.
+/// As [`gap`], with at most `left` searches: one for each pair of triangles, or of a triangle and another shape, that is compared. The searches
+/// made are subtracted from `left`; if it becomes 0, the gap could not be computed.
 pub fn gap_within([a_at, b_at]: [&Pose32; 2], [a, b]: [&dyn Shape; 2], enough_m: f64, left: &mut u32) -> Option<f64> {
     let searches = Cell::new(*left);
     let gap = gap_in_first(&a_at.inv_mul(b_at), a, b, enough_m, &searches);
@@ -48,8 +48,8 @@ pub fn gap_within([a_at, b_at]: [&Pose32; 2], [a, b]: [&dyn Shape; 2], enough_m:
     gap.filter(|_| *left > 0)
 }
 
-/// How deep two shapes that touch are in each other, in metres: how far one has to be moved at the least. What is found may be more than
-/// that, and is never less where neither is a mesh.
+/// Penetration of two shapes that touch, in metres: the shortest translation that separates them. The result may be more than that; it is never
+/// less if neither is a mesh.
 pub fn depth(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> f64 {
     let pose = a_at.inv_mul(b_at);
     let contact = DefaultQueryDispatcher.contact(&pose, a, b, ROUGH_M).ok().flatten();
@@ -66,8 +66,8 @@ pub fn depth(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> f64 
     least_overlap(&first, &second, found).map_or(0.0, |(_, overlap)| overlap.max(0.0))
 }
 
-/// Where the first of two shapes that touch has to go, as seen from the world, to be out of the other on the shortest way that is known; its length is
-/// 1. `None` where nothing is known.
+/// Direction of the shortest known translation that moves the first of two touching shapes out of the other, a unit vector in the world frame.
+/// `None` if none is known.
 pub fn way_out(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> Option<Point> {
     let pose = a_at.inv_mul(b_at);
     let contact = DefaultQueryDispatcher.contact(&pose, a, b, ROUGH_M).ok().flatten();
@@ -82,13 +82,13 @@ pub fn way_out(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> Op
     (length > SAME_M).then(|| way.map(|c| c / length))
 }
 
-/// The direction, of length 1 and seen from the first of two shapes, along which they overlap least, and how far: the second one leaves the
-/// first that way. Beside what is `found` those are tried that can be it.
+/// The direction along which two shapes overlap least, and the overlap: the second shape leaves the first that way. The direction is a unit vector
+/// in the frame of the first shape. All directions that can be it are tried, and `found`.
 fn least_overlap(first: &Round, second: &Turned, found: Option<Point>) -> Option<(Point, f64)> {
     let turned = |axes: Vec<Point>| axes.into_iter().map(|axis| second.rotate(axis)).collect::<Vec<Point>>();
     let (lines, its) = (first.core.lines(), turned(second.round.core.lines()));
-    // Across faces, across one edge or axis of each, away from an axis, and from middle to middle: whatever the way, the shapes are no deeper in each
-    // other than along it.
+    // Across faces, across pairs of edges or axes of both, away from an axis, and from middle to middle. Along any direction the overlap is an
+    // upper bound of the penetration.
     let faces = [first.core.axes(), turned(second.round.core.axes())].concat();
     let across = lines.iter().flat_map(|line| its.iter().map(|other| cross(*line, *other)));
     let aside = |line: &Point| {
@@ -106,7 +106,7 @@ fn least_overlap(first: &Round, second: &Turned, found: Option<Point>) -> Option
     ways.filter_map(overlap).min_by(|(_, a), (_, b)| a.total_cmp(b))
 }
 
-/// As [`gap`], the second shape seen from the first.
+/// As [`gap`], with the pose of the second shape in the frame of the first.
 fn gap_in_first(pose: &Pose32, a: &dyn Shape, b: &dyn Shape, enough_m: f64, searches: &Cell<u32>) -> Option<f64> {
     if let (Some(first), Some(second)) = (Round::of(a), Round::of(b)) {
         searches.set(searches.get().checked_sub(1)?);
@@ -120,7 +120,7 @@ fn gap_in_first(pose: &Pose32, a: &dyn Shape, b: &dyn Shape, enough_m: f64, sear
     }
 }
 
-/// From the surface of a mesh to another shape.
+/// Distance of the surface of a mesh from another shape.
 fn gap_to_mesh(pose: &Pose32, mesh: &TriMesh, other: &dyn Shape, enough_m: f64, searches: &Cell<u32>) -> f64 {
     // The tree rounds to `f32`.
     let beyond = (enough_m * (1.0 + ROUNDED) + ROUNDED_M) as f32;
@@ -129,7 +129,7 @@ fn gap_to_mesh(pose: &Pose32, mesh: &TriMesh, other: &dyn Shape, enough_m: f64, 
     let nearest = mesh.bvh().find_best(
         beyond,
         |node, _| Aabb { mins: node.mins() - middle - half, maxs: node.maxs() - middle + half }.distance_to_origin(),
-        // What cannot be told counts as touching; then nothing else is looked at.
+        // If the distance of a triangle cannot be computed it counts as touching; then no other triangle is tried.
         |triangle, best| {
             let gap = gap_in_first(pose, &mesh.triangle(triangle), other, f64::from(best), searches);
             Some(gap.unwrap_or(0.0) as f32)
@@ -138,7 +138,7 @@ fn gap_to_mesh(pose: &Pose32, mesh: &TriMesh, other: &dyn Shape, enough_m: f64, 
     f64::from(nearest.map_or(beyond, |(_, gap)| gap))
 }
 
-/// Between the surfaces of two meshes, the second seen from the first.
+/// Distance of the surfaces of two meshes, with the pose of the second in the frame of the first.
 fn gap_of_meshes(pose: &Pose32, first: &TriMesh, second: &TriMesh, enough_m: f64, searches: &Cell<u32>) -> f64 {
     // The trees round to `f32`.
     let beyond = (enough_m * (1.0 + ROUNDED) + ROUNDED_M) as f32;
@@ -154,7 +154,7 @@ fn gap_of_meshes(pose: &Pose32, first: &TriMesh, second: &TriMesh, enough_m: f64
     };
     for (a, b) in first.bvh().leaf_pairs(second.bvh(), are_near) {
         let enough_m = f64::from(best.get());
-        // What cannot be told counts as touching; then nothing else is looked at.
+        // If the distance of two triangles cannot be computed they count as touching; then no others are tried.
         let gap = gap_in_first(pose, &first.triangle(a), &second.triangle(b), enough_m, searches).unwrap_or(0.0) as f32;
         best.set(best.get().min(gap));
         if best.get() <= 0.0 {
@@ -164,7 +164,7 @@ fn gap_of_meshes(pose: &Pose32, first: &TriMesh, second: &TriMesh, enough_m: f64
     f64::from(best.get())
 }
 
-/// How far a point of one mesh is from one of the other, both near the other mesh: the meshes are no farther from each other than that.
+/// Upper bound of the distance of two meshes: the distance of two of their points, each near the other mesh.
 fn some_gap(pose: &Pose32, first: &TriMesh, second: &TriMesh) -> f32 {
     let middle = pose.transform_point(second.local_aabb().center());
     let on_first = first.project_local_point(middle, false).point;
@@ -174,26 +174,26 @@ fn some_gap(pose: &Pose32, first: &TriMesh, second: &TriMesh) -> f32 {
     (on_first - on_second).length() * (1.0 + ROUNDED as f32) + ROUNDED_M as f32
 }
 
-/// What a rounded shape is about.
+/// The core of a rounded shape.
 #[derive(Debug, Clone, Copy)]
 enum Core {
     Point,
     Segment([Point; 2]),
     Triangle([Point; 3]),
-    /// Half of its edges.
+    /// Half extents.
     Box(Point),
-    /// Along y: radius and half of its length.
+    /// Along y: radius and half length.
     Cylinder(f64, f64),
 }
 
-/// All points within a distance of a core.
+/// All points within a radius of a core.
 #[derive(Debug, Clone, Copy)]
 struct Round {
     core: Core,
     radius: f64,
 }
 
-/// A rounded shape as seen from another one.
+/// A rounded shape in the frame of another one.
 #[derive(Debug, Clone, Copy)]
 struct Turned {
     round: Round,
@@ -203,7 +203,7 @@ struct Turned {
 }
 
 impl Core {
-    /// The point that is farthest along a direction.
+    /// The support point: the farthest along a direction.
     fn farthest(&self, way: Point) -> Point {
         let farthest = |corners: &[Point]| {
             corners.iter().copied().max_by(|a, b| dot(*a, way).total_cmp(&dot(*b, way))).unwrap_or_default()
@@ -221,7 +221,7 @@ impl Core {
         }
     }
 
-    /// Its edges' directions, or its axis.
+    /// Directions of its edges, or its axis.
     fn lines(&self) -> Vec<Point> {
         let [x, y, z] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
         match self {
@@ -233,7 +233,7 @@ impl Core {
         }
     }
 
-    /// Directions across its faces.
+    /// Normals of its faces.
     fn axes(&self) -> Vec<Point> {
         let [x, y, z] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
         match self {
@@ -266,7 +266,7 @@ impl Round {
         sharp(Core::Triangle([triangle.a, triangle.b, triangle.c].map(point)))
     }
 
-    /// The farthest that it comes to along a direction of length 1.
+    /// Extent of the shape along a unit vector.
     fn along(&self, way: Point) -> f64 {
         dot(self.core.farthest(way), way) + self.radius
     }
@@ -275,7 +275,7 @@ impl Round {
 impl Turned {
     fn new(round: Round, pose: &Pose32) -> Turned {
         let quaternion = pose.rotation.to_array().map(f64::from);
-        // Rounding to `f32` has left it not quite of length 1.
+        // After rounding to `f32` the quaternion is not exactly of length 1.
         let length = quaternion.iter().map(|c| c * c).sum::<f64>().sqrt();
         let turn = Pose { position: [0.0; 3], quaternion_xyzw: quaternion.map(|c| c / length) };
         let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| rotate(&turn, axis));
@@ -287,7 +287,7 @@ impl Turned {
         std::array::from_fn(|i| x * a[i] + y * b[i] + z * c[i])
     }
 
-    /// The point of its core that is farthest along a direction.
+    /// The support point of the core: the farthest along a direction.
     fn farthest(&self, way: Point) -> Point {
         let local = self.round.core.farthest(self.axes.map(|axis| dot(axis, way)));
         sum(self.rotate(local), self.at)
@@ -298,19 +298,19 @@ impl Turned {
     }
 }
 
-/// The distance of two rounded shapes, or more than `enough_m`: that of their cores without the radii.
+/// Distance of two rounded shapes, or more than `enough_m`: that of their cores minus the radii.
 fn between(a: &Round, b: &Turned, enough_m: f64) -> f64 {
     let radii = a.radius + b.round.radius;
     cores_apart(&a.core, b, enough_m + radii) - radii
 }
 
-/// The distance of two cores: that of their difference, all `p - q` with `p` in one and `q` in the other, from the origin.
+/// Distance of two cores: that of the origin from their Minkowski difference, all `p - q` with `p` in one and `q` in the other.
 fn cores_apart(a: &Core, b: &Turned, enough_m: f64) -> f64 {
     let farthest = |way: Point| difference(a.farthest(way), b.farthest(way.map(|c| -c)));
     let mut simplex = Simplex::default();
     let mut nearest = farthest(if norm(b.at) > SAME_M { b.at } else { [1.0, 0.0, 0.0] });
     simplex.add(nearest);
-    // No point of the difference is nearer than this.
+    // Lower bound of the distance of the difference from the origin.
     let mut least: f64 = 0.0;
     for _ in 0..MAX_STEPS {
         let far = norm(nearest);
@@ -334,7 +334,7 @@ fn cores_apart(a: &Core, b: &Turned, enough_m: f64) -> f64 {
     least
 }
 
-/// Up to four points whose hull comes near to the origin.
+/// Up to four points whose hull approaches the origin.
 #[derive(Debug, Clone, Copy, Default)]
 struct Simplex {
     corners: [Point; 4],
@@ -355,8 +355,8 @@ impl Simplex {
         self.corners().contains(corner)
     }
 
-    /// The point of the hull that is nearest to the origin; leaves the corners of the least face that it is on, all four where the origin is
-    /// inside.
+    /// Returns the point of the hull that is nearest to the origin, and keeps only the corners of the smallest face that it is on; all four if the
+    /// origin is inside.
     fn reduce(&mut self) -> Point {
         let (mut nearest, mut least, mut face) = ([0.0; 3], f64::INFINITY, 0);
         for chosen in 1..1_usize << self.count {
@@ -373,7 +373,7 @@ impl Simplex {
         nearest
     }
 
-    /// The corners whose bits are set.
+    /// The corners of the set bits.
     fn chosen(&self, bits: usize) -> Simplex {
         let mut chosen = Simplex::default();
         (0..self.count).filter(|i| bits >> i & 1 == 1).for_each(|i| chosen.add(self.corners[i]));
@@ -381,7 +381,7 @@ impl Simplex {
     }
 }
 
-/// The point nearest to the origin of the plane through all corners, where it is between them; the origin itself where it is inside of four.
+/// The point of the plane through all corners that is nearest to the origin, if it is between them; the origin itself if it is inside of four.
 fn nearest_on(simplex: &Simplex) -> Option<Point> {
     let corners = simplex.corners();
     let first = *corners.first()?;
@@ -454,7 +454,7 @@ mod tests {
     }
 
     impl Solid {
-        /// The nearest of its points.
+        /// The point of the solid that is nearest to `to`.
         fn nearest(&self, to: Point) -> Point {
             let [x, y, z] = self.pose.inverse().transform(to);
             let about = |middle: Point, radius: f64, at: Point| {
@@ -476,7 +476,7 @@ mod tests {
             self.pose.transform(local)
         }
 
-        /// The greatest that its points come to along a direction.
+        /// Extent of the solid along a direction.
         fn along(&self, way: Point) -> f64 {
             let [x, y, z] = self.pose.inverse().rotate(way);
             let local = match self.geometry {
@@ -508,7 +508,7 @@ mod tests {
         }
     }
 
-    /// Points of two solids that are as near to each other as alternating projections come.
+    /// Points of two solids, as near to each other as alternating projections bring them.
     fn near(a: &Solid, b: &Solid, times: usize) -> [Point; 2] {
         let (mut p, mut q) = (a.pose.position, b.pose.position);
         for _ in 0..times {
@@ -528,7 +528,7 @@ mod tests {
             let way = plus(q, p, -1.0);
             let far = dot(way, way).sqrt();
             let way = way.map(|c| c / far);
-            // A plane across the way between them proves how far apart they are.
+            // A plane across the direction between them proves a minimum distance.
             let sure = -b.along(way.map(|c| -c)) - a.along(way);
             if far < 1e-3 || far - sure > 1e-7 {
                 continue;
@@ -550,7 +550,7 @@ mod tests {
                 touching += 1;
                 assert!(found <= 0.0, "{found} instead of {wanted}: {a:?} {b:?}");
                 let deep = depth(&at, &*shape, &of, &*its);
-                // Both are shapes that were made smaller by a quarter of it: no way is shorter than two quarters.
+                // Both shapes were made smaller by a quarter of it: no separating translation is shorter than two quarters.
                 assert!(deep > -0.4 * wanted, "{deep} instead of {wanted}: {a:?} {b:?}");
             }
         }
@@ -559,7 +559,7 @@ mod tests {
 
     #[test]
     fn the_work_of_two_meshes_has_a_bound() {
-        // Waves that run along each other.
+        // Two wavy surfaces whose waves run parallel.
         let height = |i: u32| f64::from(i % 2) * 1e-3;
         let at = |i: u32, j: u32| [f64::from(i) * 0.01, f64::from(j) * 0.01, height(i)];
         let cells = (0..20).flat_map(|i| (0..20).map(move |j| (i, j)));

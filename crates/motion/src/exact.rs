@@ -1,7 +1,8 @@
-//! The slow and exact check: every shape of the robot as the URDF has it, against every obstacle, by their distance ([`distance`](crate::distance)).
+//! The slow and exact collision check: every shape of the robot as in the URDF against every obstacle, by their distance
+//! ([`distance`](crate::distance)).
 //!
-//! It confirms what the vector kernels found, and says what touches what and how deep. A closed mesh is solid: what is wholly inside
-//! touches it, too.
+//! It confirms what the vector kernels found, and reports what touches what and how deep. A closed mesh is solid: a shape wholly inside touches
+//! it, too.
 
 use crate::cloud::Cloud;
 use crate::frame::compose;
@@ -22,7 +23,7 @@ pub struct Touch {
     pub link: String,
     /// An obstacle or another link.
     pub other: String,
-    /// How far one is inside the other, in metres.
+    /// Penetration in metres.
     pub depth_m: f64,
 }
 
@@ -32,7 +33,7 @@ impl fmt::Display for Touch {
     }
 }
 
-/// A robot among obstacles, exactly.
+/// A robot among obstacles, for the exact check.
 #[derive(Debug)]
 pub struct Exact<'a> {
     mechanism: &'a Mechanism,
@@ -44,16 +45,16 @@ pub struct Exact<'a> {
     pairs: Vec<(usize, usize)>,
 }
 
-/// What a link touches.
+/// The other thing that a link touches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Other<'n> {
-    /// Something that stands around, by its name.
+    /// An obstacle, by its name.
     Standing(&'n str),
-    /// Another link, whose index is the greater one.
+    /// Another link, which has the greater index.
     Link(usize),
 }
 
-/// A shape of a link or an obstacle, and its pose there.
+/// A shape of a link or an obstacle, with its pose.
 #[derive(Debug, Clone)]
 pub(crate) struct Shape {
     pub(crate) at: Pose,
@@ -67,7 +68,7 @@ impl Shape {
 }
 
 impl Placed<'_> {
-    /// How deep the deepest ball of a cloud is in this.
+    /// Penetration of the deepest ball of a cloud in this shape.
     pub(crate) fn depth_in(&self, cloud: &Cloud) -> Option<f64> {
         let mut deepest = None;
         self.meet(cloud, 0.0, &mut |_, depth| {
@@ -77,7 +78,7 @@ impl Placed<'_> {
         deepest.map(f64::from)
     }
 
-    /// Shows the balls of a cloud that come within a margin, by number, and how deep they are in that.
+    /// Calls `wants_more` with the index and penetration of each ball of a cloud within a margin, until it returns false.
     fn meet(&self, cloud: &Cloud, margin: f32, wants_more: &mut dyn FnMut(usize, f32) -> bool) {
         let reach = cloud.radius_m() as f32 + self.solid.skin_m as f32 + margin;
         let (shape, inside) = (&self.solid.shape, self.solid.inside.as_deref());
@@ -94,7 +95,7 @@ impl<'a> Exact<'a> {
         Exact { mechanism, obstacles: standing, clouds, bodies, pairs: mechanism.pairs() }
     }
 
-    /// What touches first in a posture, if anything.
+    /// The first contact found in a posture, if any.
     pub fn touch(&self, positions: &[f64]) -> Option<Touch> {
         let mut first = None;
         self.visit(positions, &mut |link, other, depth_m| {
@@ -113,7 +114,7 @@ impl<'a> Exact<'a> {
         Touch { link: name(link), other, depth_m }
     }
 
-    /// All that touches in a posture, the deepest first, once per pair of names.
+    /// All contacts in a posture, the deepest first, one per pair of names.
     pub fn touches(&self, positions: &[f64]) -> Vec<Touch> {
         let mut all: Vec<Touch> = Vec::new();
         self.visit(positions, &mut |link, other, depth_m| {
@@ -130,19 +131,19 @@ impl<'a> Exact<'a> {
         deepest
     }
 
-    /// Whether two links meet where all links are in these poses, whatever is excepted.
+    /// Whether two links collide in these poses, even if the pair is excepted.
     pub(crate) fn do_meet(&self, poses: &[Pose], a: usize, b: usize) -> bool {
         let placed = |link: usize| self.bodies[link].iter().map(move |shape| shape.placed(&poses[link]));
         placed(a).any(|body| placed(b).any(|other| body.touches(&other)))
     }
 
-    /// Keeps of these pairs of links those that meet in a posture.
+    /// Keeps only the pairs of links that collide in a posture.
     pub(crate) fn retain_meeting(&self, positions: &[f64], pairs: &mut Vec<(usize, usize)>) {
         let placed = self.placed(positions);
         pairs.retain(|&(a, b)| placed[a].iter().any(|body| placed[b].iter().any(|other| body.touches(other))));
     }
 
-    /// The numbers of a cloud's points whose balls come within `margin_m` metres of the robot.
+    /// Indices of a cloud's points whose balls come within `margin_m` metres of the robot.
     pub(crate) fn points_near(&self, positions: &[f64], cloud: &Cloud, margin_m: f64) -> BTreeSet<usize> {
         let mut near = BTreeSet::new();
         for body in self.placed(positions).iter().flatten() {
@@ -163,7 +164,7 @@ impl<'a> Exact<'a> {
         placed
     }
 
-    /// Shows what touches what and how deep, in metres, until it hears that no more is wanted.
+    /// Calls `wants_more` with each contact and its penetration in metres, until it returns false.
     pub(crate) fn visit(&self, positions: &[f64], wants_more: &mut dyn FnMut(usize, Other<'_>, f64) -> bool) {
         let placed = self.placed(positions);
         for (link, shapes) in placed.iter().enumerate() {
@@ -200,7 +201,7 @@ impl<'a> Exact<'a> {
         }
     }
 
-    /// What touches first along a path, looked at `per_radian` times per radian, and more often where a link that mimics a joint goes further.
+    /// The first contact along a path, checked at `per_radian` postures per radian, and more if a link that mimics a joint moves further than it.
     pub fn touch_along(&self, path: &[Vec<f64>], per_radian: f64) -> Option<Touch> {
         let start = path.first().and_then(|first| self.touch(first));
         let fineness = self.mechanism.fineness();
@@ -220,7 +221,7 @@ impl<'a> Exact<'a> {
     }
 }
 
-/// What stands around but clouds, by name.
+/// All obstacles except clouds, with their names.
 pub(crate) fn standing<'a>(
     obstacles: &'a [Obstacle],
     meshes: &'a [MeshObstacle],
@@ -235,7 +236,7 @@ pub(crate) fn standing<'a>(
     obstacles.iter().map(solid).chain(meshes.iter().map(mesh))
 }
 
-/// All shapes of a link as they are, larger on every side.
+/// The exact shapes of a link, padded on every side.
 pub(crate) fn shapes(link: &Link, padding_m: f64) -> Vec<Shape> {
     let primitives = link.own_bodies().iter();
     let primitives = primitives.map(|body| Shape { at: body.pose, solid: Solid::primitive(body, padding_m) });

@@ -1,31 +1,33 @@
-//! What an arm and its fingers meet where both move, each in its own time: any place of the fingers comes with any posture of the arm.
+//! Collision check for an arm and its fingers that move at the same time, each with its own timing: any position of the fingers may come with any
+//! posture of the arm.
 //!
-//! Looked at are stretches of the arm's way with stretches of the fingers'. In the middle of both, where there is more room than anything moves
-//! from there within them, they are free; else the one by which things move further is halved, until nothing moves by more than half a millimetre.
-//! That is the check of a trajectory (`validate`) with the fingers as one more joint, so nothing is too thin to be seen.
+//! A stretch of the arm's way is checked together with a stretch of the fingers' way. Both are free if, at the middle of both, the distance to
+//! everything is more than anything moves from there within them. Otherwise the stretch that causes the larger motion is halved, until nothing
+//! moves by more than half a millimetre. That is the check of a trajectory (`validate`) with the fingers as one more joint, so nothing is too thin
+//! to be found.
 
 use crate::collision::{Checker, Collision, Contact, between};
 use crate::joint_vector::JointVector;
 use crate::validate::RESOLUTION_M;
 
-/// So many looks were not enough.
+/// The maximum number of checks was not enough.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TooLong;
 
-/// Postures of an arm with places of its fingers.
+/// A stretch of the arm's way with a stretch of the fingers' way.
 #[derive(Debug, Clone, Copy)]
 struct Stretch {
-    /// From and to: a whole number is a posture of the way, between two of them the way is straight.
+    /// Start and end. A whole number is the index of a posture of the way; between two of them the way is straight.
     way: [f64; 2],
-    /// From and to this distance from the middle.
+    /// Start and end, in metres from the middle.
     fingers: [f64; 2],
 }
 
-/// The first thing found that a robot meets while its arm takes the way through these postures and its fingers go from and to these distances from the
-/// middle, in metres. What meets where both begin may. `checker` is one without padding.
+/// The first collision found while the arm follows a way through `postures` and each finger moves between two distances from the middle, in
+/// metres. Pairs that already collide at the start of both are ignored. `checker` has no padding.
 ///
 /// # Errors
-/// Where it is not found out by `most` looks.
+/// If `most` checks do not decide it.
 pub fn met_on_the_way(
     mut checker: Checker<'_>,
     postures: &[JointVector],
@@ -64,12 +66,12 @@ fn middle([from, to]: [f64; 2]) -> f64 {
     (from + to) / 2.0
 }
 
-/// The first half is taken first.
+/// Both halves; the first one is last, because the last is checked first.
 fn halves(whole: [f64; 2]) -> [[f64; 2]; 2] {
     [[middle(whole), whole[1]], [whole[0], middle(whole)]]
 }
 
-/// The posture at a place of the way.
+/// The posture at a position of the way.
 fn at(postures: &[JointVector], place: f64) -> JointVector {
     let before = place.floor() as usize;
     match postures.get(before + 1) {
@@ -78,7 +80,7 @@ fn at(postures: &[JointVector], place: f64) -> JointVector {
     }
 }
 
-/// How far each joint is at the most from where it is in a posture, on a part of the way.
+/// Maximum deviation of each joint from a posture on a part of the way.
 fn strays(postures: &[JointVector], [from, to]: [f64; 2], posture: &JointVector) -> JointVector {
     let within = &postures[from.ceil() as usize..=to.floor() as usize];
     let ends = [at(postures, from), at(postures, to)];

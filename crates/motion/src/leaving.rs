@@ -1,32 +1,33 @@
-//! Leaving what the gripper touches where the arm stands: what planners call a retreat from a start in contact.
+//! Leaving an object that the gripper touches at the start: what planners call a retreat from a start in contact.
 //!
-//! What is believed of an object may be off, or somebody has moved it, so that the gripper is in it where the arm stands. The arm may leave it on
-//! a way on which it gets deeper into nothing: from posture to posture no part of the gripper may be deeper in an object than it has ever been
-//! since the start, and what it has left is not touched again. All that was not touched at the start counts as ever
-//! ([`Leaving::of_the_rest`]). So an arm that retreats pushes nothing.
+//! The believed pose of an object may be wrong, or somebody has moved it, so that the gripper is inside it at the start. The arm may leave it on a
+//! way on which no penetration grows: from posture to posture no part of the gripper may be deeper in an object than its minimum since the start,
+//! and an object that has been left is not touched again. Everything that was not touched at the start is checked as always
+//! ([`Leaving::of_the_rest`]). So a retreating arm pushes nothing.
 //!
-//! The gripper goes straight, and the depth of two convex shapes has no valley along a straight line: it is enough to look at postures close to each other.
+//! The gripper moves straight, and the penetration of two convex shapes has no valley along a straight line: checking postures close to each other
+//! is enough.
 
 use crate::collision::{Checker, Collision, Contact, Touch, between};
 use crate::joint_vector::JointVector;
 
-/// How much deeper something may be than it has ever been since the start, in metres: rounding, and what is no contact to anybody.
+/// Tolerance for the growth of a penetration, in metres: rounding, and what nobody would call a contact.
 const GROWS_M: f64 = 5e-4;
 
-/// What may touch what that did not at the start: fingers and what they hold may be nearer than the padding, as before a departure.
+/// Contacts allowed with things not touched at the start: fingers and what they hold may be nearer than the padding, as before a departure.
 pub(crate) const NOTHING_NEW: Contact = Contact::Gripper(0.0);
 
-/// What the gripper touched at the start, and how deep it has been at the least since.
+/// The contacts of the gripper at the start, with the minimum penetration of each since.
 #[derive(Debug, Clone)]
 pub(crate) struct Leaving {
     touches: Vec<Touch>,
-    /// Of the deepest at the start.
+    /// The deepest contact at the start.
     told: Collision,
     shortest_way_out: Option<[f64; 3]>,
 }
 
 impl Leaving {
-    /// From a posture in which the gripper is in something; `None` where it is in nothing.
+    /// For a posture in which the gripper is inside something; `None` if it touches nothing.
     pub(crate) fn from(checker: &mut Checker<'_>, start: &JointVector) -> Option<Leaving> {
         let touches = checker.touches(start);
         let deepest = touches.iter().max_by(|a, b| a.depth_m.total_cmp(&b.depth_m))?;
@@ -34,7 +35,7 @@ impl Leaving {
         Some(Leaving { touches, told, shortest_way_out })
     }
 
-    /// What was touched deepest at the start.
+    /// The deepest contact at the start.
     pub(crate) fn told(&self) -> Collision {
         self.told.clone()
     }
@@ -44,20 +45,20 @@ impl Leaving {
         self.touches.iter().any(|touch| touch.is_held)
     }
 
-    /// The shortest way out of that, in the world frame, of length 1.
+    /// Direction of the shortest way out of the deepest contact, a unit vector in the world frame.
     pub(crate) fn shortest_way_out(&self) -> Option<[f64; 3]> {
         self.shortest_way_out
     }
 
-    /// A checker of all that was not touched at the start.
+    /// The checker for everything that was not touched at the start.
     pub(crate) fn of_the_rest<'a>(&self, checker: &Checker<'a>) -> Checker<'a> {
         checker.without(&self.touches)
     }
 
-    /// The arm goes straight from posture to posture, in the order of the motion; the same checker looks.
+    /// Follows the arm on a straight motion from posture to posture, in the order of the motion, always with the same checker.
     ///
     /// # Errors
-    /// What gets deeper.
+    /// The contact that gets deeper.
     pub(crate) fn goes(
         &mut self,
         checker: &mut Checker<'_>,
@@ -68,10 +69,10 @@ impl Leaving {
         (1..=steps).try_for_each(|i| self.comes_to(checker, &between(from, to, i as f64 / steps as f64)))
     }
 
-    /// The arm comes to a posture, close to the one before.
+    /// Moves the arm to a posture close to the one before.
     ///
     /// # Errors
-    /// What gets deeper.
+    /// The contact that gets deeper.
     pub(crate) fn comes_to(&mut self, checker: &mut Checker<'_>, posture: &JointVector) -> Result<(), Collision> {
         let depths_m = checker.depths_m(&self.touches, posture);
         for (touch, depth_m) in self.touches.iter_mut().zip(depths_m) {
@@ -83,7 +84,7 @@ impl Leaving {
         Ok(())
     }
 
-    /// Whether everything that was touched has been left.
+    /// Whether all contacts of the start have been left.
     pub(crate) fn is_over(&self) -> bool {
         self.touches.iter().all(|touch| touch.depth_m <= 0.0)
     }

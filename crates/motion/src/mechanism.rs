@@ -1,7 +1,7 @@
-//! What is planned for of a robot: its links moved by some of its joints, bounding spheres for the fast checks, the exact shapes for the
-//! others, and the pairs of links that may meet.
+//! The robot as the planner sees it: links moved by the planned joints, bounding spheres for the fast checks, exact shapes for the others, and the
+//! pairs of links that are excepted from checks.
 //!
-//! The other joints are held where a [`RobotState`] has them.
+//! The joints that are not planned are held where a [`RobotState`] has them.
 
 use crate::geometry::Body;
 use crate::mesh::MeshError;
@@ -14,37 +14,37 @@ use ratn_model::pose::Pose;
 use std::collections::BTreeSet;
 use std::fmt;
 
-/// Joints that can be planned for at once.
+/// Maximum number of planned joints.
 pub const MAX_JOINTS: usize = 16;
 
-/// How far beyond a limit a position is taken as rounded, in radians (metres for a joint that slides).
+/// Tolerance by which a position may exceed a limit, for rounding, in radians (metres for a prismatic joint).
 pub const ROUNDED: f64 = 1e-4;
 
-/// A robot as it is planned for.
+/// A robot with its planned joints.
 #[derive(Debug, Clone)]
 pub struct Mechanism {
-    /// As in the URDF.
+    /// Name as in the URDF.
     pub name: String,
-    /// What is planned for, in the caller's order.
+    /// The planned joints, in the caller's order.
     pub joints: Vec<Joint>,
     /// Parents before children.
     pub links: Vec<Link>,
     /// Pairs of links, the lower index first, that are never checked against each other.
     pub excepted: BTreeSet<(usize, usize)>,
-    /// Pairs that are checked by their exact shapes alone: their spheres say nothing ([`pairs`](crate::pairs)).
+    /// Pairs that are checked by their exact shapes only, because their spheres decide nothing ([`pairs`](crate::pairs)).
     pub by_shapes: BTreeSet<(usize, usize)>,
-    /// Links and the names of obstacles that they may touch.
+    /// Links and the names of obstacles that each may touch.
     pub allowed: BTreeSet<(usize, String)>,
 }
 
-/// A position that is beyond a limit.
+/// A position that exceeds a limit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Beyond {
     /// The joint's name.
     pub joint: String,
-    /// As given, in radians (metres for one that slides).
+    /// The given position, in radians (metres for a prismatic joint).
     pub position: f64,
-    /// How far beyond.
+    /// By how much it exceeds the limit.
     pub by: f64,
 }
 
@@ -55,22 +55,22 @@ impl fmt::Display for Beyond {
     }
 }
 
-/// Why there is no robot.
+/// Why a robot cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum MechanismError {
-    /// The URDF says nothing that can be used.
+    /// The URDF is invalid.
     #[error(transparent)]
     Robot(#[from] RobotError),
     /// The SRDF is not XML.
     #[error("the SRDF is not valid XML: {0}")]
     Srdf(String),
-    /// A joint that is named twice.
+    /// A joint is named twice.
     #[error("the joint `{joint}` is named twice among those to be planned for")]
     Twice {
         /// Its name.
         joint: String,
     },
-    /// Too many joints.
+    /// Too many joints are to be planned for.
     #[error("{count} joints are to be planned for: at most {MAX_JOINTS} are supported")]
     TooMany {
         /// How many.
@@ -79,8 +79,8 @@ pub enum MechanismError {
 }
 
 impl Mechanism {
-    /// Reads a robot without meshes; `joints` are planned for, without any all that move and follow no other. The others stay at
-    /// zero, or at the limit next to it; [`RobotModel::planned`] holds them elsewhere.
+    /// Reads a robot without meshes. `joints` are planned for; if there are none, all joints that move and mimic no other. The other joints stay
+    /// at zero, or at the limit next to it; [`RobotModel::planned`] holds them elsewhere.
     ///
     /// # Errors
     /// [`MechanismError`] names the joint or link that is missing or not supported.
@@ -89,7 +89,7 @@ impl Mechanism {
         model.planned(joints, &RobotState::neutral(&model))
     }
 
-    /// As [`Mechanism::read`]; `load` gives what is in the mesh file that the URDF names so
+    /// As [`Mechanism::read`]; `load` returns the content of a mesh file by the name in the URDF
     /// ([`MeshFiles::read`](crate::mesh_files::MeshFiles::read)).
     ///
     /// # Errors
@@ -104,7 +104,7 @@ impl Mechanism {
         model.planned(joints, &RobotState::neutral(&model))
     }
 
-    /// Links moved by the joints that are planned for, of which those pairs are checked.
+    /// Links moved by the planned joints, with the pairs to check.
     pub(crate) fn new(name: &str, joints: Vec<Joint>, links: Vec<Link>, checks: Checks) -> Mechanism {
         let Checks { excepted, by_shapes, .. } = checks;
         Mechanism { name: name.to_owned(), joints, links, excepted, by_shapes, allowed: BTreeSet::new() }
@@ -120,7 +120,7 @@ impl Mechanism {
         self.links.iter().position(|link| link.name == name)
     }
 
-    /// Takes a link's bodies `padding_m` metres larger on every side, in every check.
+    /// Grows a link's bodies by `padding_m` metres on every side, in every check.
     pub fn pad(&mut self, link: usize, padding_m: f64) {
         let link = &mut self.links[link];
         link.padding_m = padding_m;
@@ -136,8 +136,8 @@ impl Mechanism {
         }
     }
 
-    /// Fixes something to a link, as a link of its own, which is given back; bodies in the frame of the link that holds it. It
-    /// may touch that link and those that are listed.
+    /// Attaches something to a link, as a link of its own, and returns its index. The bodies are in the frame of the link that holds it. It may
+    /// touch that link and those in `touching`.
     pub fn attach(&mut self, name: &str, link: usize, bodies: Vec<Body>, touching: &[usize]) -> usize {
         let index = self.links.len();
         let spheres = bodies.iter().flat_map(spheres::cover).collect();
@@ -146,27 +146,27 @@ impl Mechanism {
         index
     }
 
-    /// Lets a link touch an obstacle.
+    /// Allows a link to touch an obstacle.
     pub fn allow(&mut self, link: usize, obstacle: &str) {
         self.allowed.insert((link, obstacle.to_owned()));
     }
 
-    /// Whether a link is to be kept away from an obstacle.
+    /// Whether a link is to be kept apart from an obstacle.
     pub fn is_kept_from(&self, link: usize, obstacle: &str) -> bool {
         self.allowed.is_empty() || !self.allowed.contains(&(link, obstacle.to_owned()))
     }
 
-    /// Whether two links are to be kept apart: not where the pair is excepted, nor where no planned joint moves one against the other.
+    /// Whether two links are to be kept apart: not if the pair is excepted, nor if no planned joint moves one relative to the other.
     pub fn is_checked(&self, a: usize, b: usize) -> bool {
         self.carrier(a) != self.carrier(b) && !self.excepted.contains(&(a.min(b), a.max(b)))
     }
 
-    /// As [`Mechanism::is_checked`], with the carriers of all links: for who asks of many pairs.
+    /// As [`Mechanism::is_checked`], with the carriers of all links, for callers that ask for many pairs.
     pub(crate) fn is_checked_among(&self, carriers: &[Option<usize>], a: usize, b: usize) -> bool {
         carriers[a] != carriers[b] && !self.excepted.contains(&(a.min(b), a.max(b)))
     }
 
-    /// Of each link what [`Mechanism::carrier`] says.
+    /// The [`Mechanism::carrier`] of each link.
     pub(crate) fn carriers(&self) -> Vec<Option<usize>> {
         let mut carriers: Vec<Option<usize>> = Vec::with_capacity(self.links.len());
         for (index, link) in self.links.iter().enumerate() {
@@ -178,17 +178,17 @@ impl Mechanism {
         carriers
     }
 
-    /// Whether two links are told apart by their exact shapes alone.
+    /// Whether two links are checked by their exact shapes only.
     pub fn is_by_shapes(&self, a: usize, b: usize) -> bool {
         self.by_shapes.contains(&(a.min(b), a.max(b)))
     }
 
-    /// Whether two links are told apart so of which one at least has meshes that spheres stand for: they may be built to run close to each other.
+    /// Whether two links are checked so and at least one has meshes covered by spheres: such links may be built to run close to each other.
     pub(crate) fn is_by_meshes(&self, a: usize, b: usize) -> bool {
         self.is_by_shapes(a, b) && [a, b].iter().any(|link| self.links[*link].covers > 0)
     }
 
-    /// The link nearest to a link towards the root, itself included, that a planned joint moves.
+    /// The first link from a link towards the root, itself included, that a planned joint moves.
     pub(crate) fn carrier(&self, link: usize) -> Option<usize> {
         let mut next = Some(link);
         while let Some(here) = next.filter(|here| self.links[*here].drive.is_none()) {
@@ -205,8 +205,8 @@ impl Mechanism {
         pairs.filter(|(a, b)| self.is_checked_among(&carriers, *a, *b)).collect()
     }
 
-    /// How many times as closely motions of each joint have to be looked at: more often than once where a link that mimics it turns or slides
-    /// several times as far. What turns near its axis does not go far: up to a metre, the reach of its shapes counts.
+    /// Factor by which the motions of each joint are checked more closely: above 1 if a link that mimics the joint turns or slides several times
+    /// as far. A link near its axis does not move far: for a rotation the factor is multiplied by the reach of the shapes in metres, at most 1.
     pub(crate) fn fineness(&self) -> Vec<f64> {
         let mut fineness = vec![1.0_f64; self.joints.len()];
         for (index, link) in self.links.iter().enumerate().filter(|(_, link)| !link.spheres.is_empty()) {
@@ -231,7 +231,7 @@ impl Mechanism {
         fineness
     }
 
-    /// Positions, of which those that are beyond a limit by no more than [`ROUNDED`] are at the limit, and which were.
+    /// The positions, with those that exceed a limit by no more than [`ROUNDED`] moved to the limit; and which these are.
     pub fn clamped(&self, positions: &[f64]) -> (Vec<f64>, Vec<Beyond>) {
         let mut beyond = Vec::new();
         let clamp = |(joint, position): (&Joint, &f64)| {
@@ -246,12 +246,12 @@ impl Mechanism {
         (self.joints.iter().zip(positions).map(clamp).collect(), beyond)
     }
 
-    /// Whether nothing with a shape is between two links.
+    /// Whether no link with a shape is between two links.
     pub(crate) fn are_neighbours(&self, a: usize, b: usize) -> bool {
         self.solid_parent(b) == Some(a) || self.solid_parent(a) == Some(b)
     }
 
-    /// The next link towards the root that has a shape.
+    /// The first link towards the root that has a shape.
     fn solid_parent(&self, link: usize) -> Option<usize> {
         let mut next = self.links[link].parent;
         while let Some(parent) = next.filter(|p| self.links[*p].spheres.is_empty()) {

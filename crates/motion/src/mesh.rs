@@ -85,7 +85,7 @@ pub struct Mesh {
     solid: OnceLock<(SharedShape, Arc<Inside>)>,
     /// Spheres that cover it, computed when first needed.
     cover: OnceLock<Vec<Sphere>>,
-    /// Convex pieces that do, made when they are first asked for.
+    /// Convex pieces that hold it, computed when first needed.
     pieces: OnceLock<MeshPieces>,
 }
 
@@ -194,7 +194,7 @@ impl Mesh {
         let corners = self.triangles.iter().flatten().map(|[x, y, z]| Vector::new(*x as f32, *y as f32, *z as f32));
         let indices = (0..self.triangles.len() as u32).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
         let ball = || SharedShape::ball(0.0);
-        // parry3d only refuses a mesh without triangles, which does not exist.
+        // parry3d refuses only a mesh without triangles, and no such mesh exists.
         SharedShape::trimesh(corners.collect(), indices).unwrap_or_else(|_| ball())
     }
 
@@ -218,7 +218,7 @@ impl Mesh {
         (0..3).map(along).fold(0.0, f64::max)
     }
 
-    /// Convex pieces that hold it; the same ones whenever they are asked for.
+    /// Convex pieces that hold it; the same ones at every call.
     pub fn pieces(&self) -> &MeshPieces {
         self.pieces.get_or_init(|| {
             let (shape, inside) = self.solid();
@@ -226,7 +226,7 @@ impl Mesh {
         })
     }
 
-    /// Spheres that cover it, `padding` metres larger.
+    /// Spheres that cover it, each `padding` metres larger.
     pub fn cover(&self, padding: f64) -> Vec<Sphere> {
         let spheres = self.cover.get_or_init(|| mesh_cover::cover(&self.triangles));
         spheres.iter().map(|sphere| Sphere { radius: sphere.radius + padding.max(0.0), ..*sphere }).collect()
@@ -234,7 +234,7 @@ impl Mesh {
 }
 
 impl Meshed {
-    /// Spheres in the link's frame that cover it, `padding` metres larger.
+    /// Spheres in the link's frame that cover it, each `padding` metres larger.
     pub fn cover(&self, padding: f64) -> Vec<Sphere> {
         let spheres = self.mesh.cover(padding).into_iter();
         spheres.map(|s| Sphere { centre: self.pose.transform(s.centre), ..s }).collect()

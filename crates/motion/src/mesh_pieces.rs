@@ -1,12 +1,14 @@
-//! Convex pieces that hold a mesh, few and close to it, for an engine of rigid bodies: such engines are quick and sure with convex bodies alone.
+//! Convex decomposition of a mesh: few convex pieces that hold the mesh and fit it closely, for a physics engine, because such engines are fast
+//! and reliable with convex bodies only.
 //!
-//! The hull of the mesh is the first piece. The piece that stands out of the mesh most is cut in two, again and again, until none stands out by more than
-//! [`CLOSE_M`] or there are [`MOST_PIECES`]. What a surface closes in is in its hull, and so is what a plane cuts off of it in the hull of what it cuts off of
-//! the surface: the pieces hold the mesh with its inside. A cut goes through the place of the surface that is below where the piece stands out most, along
-//! two axes of the mesh: of three such cuts the one that leaves the least volume.
+//! The hull of the mesh is the first piece. The piece that stands out of the mesh most is cut in two, again and again, until none stands out by
+//! more than [`CLOSE_M`] or there are [`MOST_PIECES`]. The volume inside a surface is in the hull of the surface, and its part on one side of a
+//! plane is in the hull of the surface's part on that side: so the pieces hold the mesh with its inside. A cut is perpendicular to an axis of the
+//! mesh and goes through the point of the surface that is nearest to where the piece stands out most; of the three such cuts the one that leaves
+//! the least volume is taken.
 //!
-//! Of a piece with many corners those make the hull that are the farthest in some hundred directions. It is less than the whole hull by less than a
-//! two-hundredth of the way from the middle of the piece to its border.
+//! The hull of a piece with many corners is made of the corners that are farthest along some hundred directions. It falls short of the whole hull
+//! by less than 1/200 of the distance from the middle of the piece to its border.
 
 use crate::frame::{cross, difference, norm};
 use crate::inside::Inside;
@@ -16,18 +18,18 @@ use parry3d::shape::SharedShape;
 use parry3d::transformation::try_convex_hull;
 use std::f64::consts::PI;
 
-/// How far pieces may stand out of a mesh, in metres, unless that takes too many; and how many there are at the most.
+/// How far pieces may stand out of a mesh, in metres, unless that takes too many pieces; and the maximum number of pieces.
 const CLOSE_M: f64 = 0.002;
 const MOST_PIECES: usize = 24;
 
-/// Directions of which the farthest corners make a hull, where a piece has more than that.
+/// Number of directions whose farthest corners make a hull, if a piece has more corners than that.
 const DIRECTIONS: usize = 400;
 
-/// How far apart the places of a hull are that are looked at, in metres, and how many there are along an edge at the most.
+/// Distance of the points at which a hull is compared with the mesh, in metres, and their maximum number along an edge.
 const LOOK_M: f64 = 0.01;
 const MOST_ALONG: usize = 8;
 
-/// What is flat is so thick, in metres.
+/// Thickness given to a flat piece, in metres.
 const THICK_M: f64 = 1e-4;
 
 type Corner = [f64; 3];
@@ -36,9 +38,9 @@ type Polygon = Vec<Corner>;
 /// Convex pieces that hold a mesh.
 #[derive(Debug, Clone)]
 pub struct MeshPieces {
-    /// The corners of each.
+    /// The corners of each piece.
     pub hulls: Vec<Vec<Corner>>,
-    /// How far any of them stands out of the mesh where that was looked at, in metres.
+    /// How far a piece stands out of the mesh at most, at the points that were compared, in metres.
     pub stands_out_m: f64,
 }
 
@@ -46,7 +48,7 @@ pub struct MeshPieces {
 struct Piece {
     surface: Vec<Polygon>,
     hull: Hull,
-    /// How far it stands out, and the nearest place of the surface there.
+    /// How far it stands out, and the nearest point of the surface there.
     out_m: f64,
     below: Corner,
 }
@@ -56,13 +58,13 @@ struct Hull {
     faces: Vec<[Corner; 3]>,
 }
 
-/// The mesh.
+/// The whole mesh.
 struct Whole<'m> {
     shape: &'m SharedShape,
     inside: &'m Inside,
 }
 
-/// Pieces of triangles, whose surface and inside are these.
+/// The convex pieces of a mesh, given by its triangles, its surface and its inside.
 pub(crate) fn pieces(triangles: &[[Corner; 3]], shape: &SharedShape, inside: &Inside) -> MeshPieces {
     let whole = Whole { shape, inside };
     let mut pieces = vec![whole.piece(triangles.iter().map(|triangle| triangle.to_vec()).collect())];
@@ -98,7 +100,7 @@ impl Whole<'_> {
 }
 
 impl Piece {
-    /// The surface on both sides of a plane.
+    /// The surface on both sides of the best cut.
     fn halves(&self) -> Option<[Vec<Polygon>; 2]> {
         let sides = |axis: usize, at: f64| {
             let side = |side: f64| -> Vec<Polygon> {
@@ -108,7 +110,7 @@ impl Piece {
             [side(1.0), side(-1.0)]
         };
         let below = (0..3).map(|axis| (axis, self.below[axis]));
-        // Where the surface there is at the end of the piece, a cut through the middle makes it smaller.
+        // If the surface point is at the end of the piece, a cut through the middle makes the piece smaller.
         let middle = (0..3).map(|axis| (axis, self.hull.range(axis).iter().sum::<f64>() / 2.0));
         let mut best: Option<(f64, [Vec<Polygon>; 2])> = None;
         for (axis, at) in below.chain(middle) {
@@ -137,7 +139,7 @@ impl Hull {
                 let faces = faces.iter().map(|face| face.map(|corner| corners[corner as usize])).collect();
                 Hull { corners, faces }
             }
-            // What is flat, or a line.
+            // A flat piece, or a line.
             _ => Hull { corners: thickened(&corners), faces: Vec::new() },
         }
     }
@@ -158,7 +160,7 @@ impl Hull {
     }
 }
 
-/// Corners whose hull is that of all: those that are the farthest in many directions, where there are more.
+/// Corners whose hull is that of all; if there are too many, only those that are the farthest along many directions.
 fn farthest(surface: &[Polygon]) -> Vec<Corner> {
     let mut all: Vec<Corner> = surface.iter().flatten().copied().collect();
     all.sort_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])).then(a[2].total_cmp(&b[2])));
@@ -166,7 +168,7 @@ fn farthest(surface: &[Polygon]) -> Vec<Corner> {
     if all.len() <= DIRECTIONS {
         return all;
     }
-    // Points on a sphere, evenly, by the golden angle.
+    // Points evenly spread on a sphere by the golden angle.
     let golden = PI * (3.0 - 5.0_f64.sqrt());
     let direction = |i: usize| {
         let z = 1.0 - (2.0 * i as f64 + 1.0) / DIRECTIONS as f64;
@@ -191,7 +193,7 @@ fn farthest(surface: &[Polygon]) -> Vec<Corner> {
     taken.into_iter().map(|i| all[i]).collect()
 }
 
-/// Points around each corner.
+/// Points around each corner, which give a flat piece a thickness.
 fn thickened(corners: &[Corner]) -> Vec<Corner> {
     let beside = |corner: &Corner| {
         let corner = *corner;
@@ -206,11 +208,11 @@ fn thickened(corners: &[Corner]) -> Vec<Corner> {
     corners.iter().flat_map(beside).collect()
 }
 
-/// Places of a face, its corners not among them.
+/// Sample points of a face, without its corners.
 fn places(face: &[Corner; 3]) -> Vec<Corner> {
     let [a, b, c] = *face;
     let longest = [[a, b], [b, c], [c, a]].iter().map(|[p, q]| norm(difference(*p, *q))).fold(0.0, f64::max);
-    // No place of a small face is farther from its corners, which are of the mesh.
+    // No point of a small face is farther than `CLOSE_M` from its corners, which are points of the mesh.
     if longest < CLOSE_M {
         return Vec::new();
     }
@@ -231,7 +233,7 @@ mod tests {
     use super::*;
     use crate::mesh::Mesh;
 
-    /// A prism over an outline that turns to the left, of which the triangles of its faces are given.
+    /// A prism over a counterclockwise outline; `faces` has the triangles of its end faces.
     fn prism(outline: &[[f64; 2]], faces: &[[usize; 3]], height: f64) -> Mesh {
         let at = |i: usize, z: f64| [outline[i][0], outline[i][1], z];
         let mut triangles = Vec::new();
@@ -266,7 +268,7 @@ mod tests {
 
     #[test]
     fn every_point_of_a_curved_mesh_is_in_a_piece_and_the_pieces_stay_close() {
-        // A half ring, of which many corners are the surface.
+        // A half ring whose surface has many corners.
         let (inner, outer, steps) = (0.06, 0.1, 60);
         let on = |radius: f64, i: usize| {
             let (sin, cos) = (PI * i as f64 / steps as f64).sin_cos();

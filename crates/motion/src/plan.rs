@@ -4,13 +4,12 @@
 //! start ─ straight (depart) ─ free path: RRT-Connect, then improvement ─ straight (approach) ─ goal
 //! ```
 //!
-//! A goal is a list of alternatives, and a pose has many postures: every posture from which the approach is free is a
-//! candidate end of the free path. On straight parts, checked by exact shapes, the fingers and what they hold may touch their
-//! surroundings, the arm may not. On the free path nothing touches anything: it is searched with the vector checks, between
-//! postures that have room for them; where the start or a candidate has less, a short way out of there comes first. Where the
-//! tool is to stay upright, the free path keeps it so (`constrained`), and the straight parts do anyway. Where the tool is to go in
-//! straight lines, they take the place of the free path (`way_points`). Where the gripper is in something at the start, a retreat from there
-//! comes first (`retreat`).
+//! A goal is a list of alternatives, and a pose has many postures: every posture from which the approach is free is a candidate end of the free
+//! path. On straight parts, checked by exact shapes, the fingers and what they hold may touch their surroundings, the arm may not. The free path
+//! has no contact at all: it is searched with the vector checks, between postures that have room for them; if the start or a candidate has less
+//! room, a short way out of there comes first. If the tool is to stay upright, the free path keeps it so (`constrained`); the straight parts do
+//! anyway. If the tool is to move in straight lines, they replace the free path (`way_points`). If the gripper is inside an object at the start, a
+//! retreat comes first (`retreat`).
 
 mod arm_in_scene;
 mod candidates;
@@ -42,7 +41,7 @@ use ratn_model::value::Trajectory;
 use ratn_world::scene::Scene;
 use straight_ways::plan_straight;
 
-/// Iterations of the search before it gives up by itself.
+/// Maximum number of iterations of the search.
 const MAX_SEARCH_ITERATIONS: usize = 20_000;
 
 /// A planned motion.
@@ -50,19 +49,19 @@ const MAX_SEARCH_ITERATIONS: usize = 20_000;
 pub struct Plan {
     /// The trajectory: times in seconds, positions in radians, velocities in radians per second.
     pub trajectory: Trajectory,
-    /// The posture in which it ends, in radians.
+    /// The posture at the end, in radians.
     pub end: JointVector,
-    /// The tool frame there, in the world frame.
+    /// The pose of the tool frame at the end, in the world frame.
     pub end_pose: Pose,
     /// Length of the first path in joint space (radians, Euclidean), straight parts included.
     pub first_length_rad: f64,
     /// Length of the path that the trajectory follows, before its corners were rounded.
     pub length_rad: f64,
-    /// How long the motion along the first path takes, after its shortcutting, in seconds: never less than the trajectory does.
+    /// Duration of the motion along the first path after shortcutting, in seconds: never less than that of the trajectory.
     pub first_duration_s: f64,
     /// Iterations of search and improvement.
     pub iterations: usize,
-    /// The caller's time was up before all iterations of improvement were done: with more time the path may be another.
+    /// Whether the caller's time was up before all iterations of improvement were done: with more time the path may be another.
     pub time_up: bool,
 }
 
@@ -86,13 +85,13 @@ pub fn plan(
     };
     match plan_with_ends(&arm.robot, scene, &arm.request(request), &mut told) {
         Ok(plan) => Ok(arm.wound(plan)),
-        // The same ones, turned to by other ways.
+        // These are the original goals, reached by other turns.
         Err(PlanError::NoGoal { reasons, .. }) => Err(PlanError::NoGoal { goals: request.goals.len(), reasons }),
         Err(error) => Err(error),
     }
 }
 
-/// The same of an arm all of whose joints have ends.
+/// As `plan`, for an arm without continuous joints.
 fn plan_with_ends(
     robot: &Robot,
     scene: &Scene,
@@ -125,7 +124,7 @@ fn plan_with_ends(
     }
 }
 
-/// From the door at the start to that of a candidate.
+/// The first free path from the door at the start to the door of a candidate.
 fn first_way(
     arm: &mut ArmInScene<'_>,
     start: &JointVector,
@@ -158,7 +157,7 @@ fn first_way(
     }
 }
 
-/// Whether motions can begin in a posture that touches nothing.
+/// Whether a posture that touches nothing has enough room for a motion to begin there.
 ///
 /// # Errors
 /// [`PlanError::NoRoom`] names what is close.

@@ -1,11 +1,10 @@
-//! Anytime improvement: as long as there is time, the path gets better.
+//! Anytime improvement: the path gets better as long as there is time.
 //!
-//! Better is quicker by a rough estimate of its duration (`timing::rough`), or shorter, as the caller measures. Five ways, chosen at
-//! random: shortcuts between two points of the path; corners moved towards where the path would rather be;
-//! other ends that the path can turn to on its way; a new search where a shorter path could run at all (the ellipsoids
-//! between the start and the ends); and a tree of shortest ways that grows there from step to step (`rrt_star`), takes in the path
-//! whenever that has become better, and gives back what is better still. The best path is never lost. Its motions are as
-//! certain as the space checks them. A path that keeps a constraint has the first three, along the constraint.
+//! Better means quicker by an estimate of the duration (`timing::rough`), or shorter, as the caller measures. Each step chooses one of five ways
+//! at random: a shortcut between two points of the path; a corner moved to where the path would be better; a turn to another end on the way; a new
+//! search where a shorter path could run at all (the ellipsoids between the start and the ends); or growth of an RRT* tree there (`rrt_star`),
+//! which is kept from step to step, adopts the path whenever that has become better, and returns better ones. The best path is never lost. Its
+//! motions are as certain as the space's checks. A path under a constraint uses the first three, along the constraint.
 
 use crate::connect::{ConnectError, grow};
 use crate::constrained::{Constraint, walk};
@@ -21,31 +20,31 @@ use rand_chacha::ChaCha8Rng;
 /// A step must gain at least this much, in radians or seconds.
 const LEAST_GAIN: f32 = 1e-4;
 
-/// How much longer than the path a quicker one is looked for, as a share of it.
+/// How much longer than the path a quicker one may be, as a fraction of its length.
 const LONGER: f32 = 0.2;
 
-/// Iterations of one new search.
+/// Number of iterations of one new search.
 const SEARCH_ITERATIONS: usize = 200;
 
-/// How far a corner is moved off its way at most, in radians, and as a share of the sides next to it.
+/// Maximum offset of a moved corner, in radians, and as a fraction of the sides next to it.
 const STRAY: f32 = 0.1;
 const STRAY_SHARE: f32 = 0.25;
 
-/// Samples of the tree in one step.
+/// Number of samples of the tree in one step.
 const TREE_SAMPLES: usize = 8;
 
-/// How often each way is chosen, of the sum of all.
+/// The weight of each way; it is chosen with this share of the sum.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shares {
     /// Shortcuts between two points of the path.
     pub shortcut: u32,
-    /// Corners moved.
+    /// Moved corners.
     pub corner: u32,
-    /// Other ends.
+    /// Turns to other ends.
     pub turn: u32,
     /// New searches.
     pub search: u32,
-    /// Samples of the tree.
+    /// Growth of the tree.
     pub tree: u32,
 }
 
@@ -53,47 +52,47 @@ impl Shares {
     /// For arms: with seven joints new searches find more than the tree does (docs/performance.md).
     pub const MIXED: Shares = Shares { shortcut: 42, corner: 38, turn: 8, search: 11, tree: 1 };
 
-    /// For paths that keep a constraint.
+    /// For paths under a constraint.
     const CONSTRAINED: Shares = Shares { shortcut: 45, corner: 45, turn: 10, search: 0, tree: 0 };
 }
 
-/// What makes a path good.
+/// The measure of a path.
 #[derive(Debug, Clone)]
 pub enum Measure {
-    /// It is short, in radians.
+    /// Its length, in radians.
     Length,
-    /// It is quick, in seconds.
+    /// Its duration, in seconds.
     Duration(Box<Rough>),
 }
 
-/// Where a path may end.
+/// A possible end of a path.
 #[derive(Debug, Clone, PartialEq)]
 pub struct End {
-    /// Free.
+    /// The posture, which is free.
     pub state: State,
-    /// Length of what follows there, in radians.
+    /// Length of the motion that follows, in radians.
     pub rest: f32,
-    /// How long that takes, in seconds.
+    /// Duration of the motion that follows, in seconds.
     pub rest_s: f32,
 }
 
-/// A path that becomes better.
+/// A path under improvement.
 #[derive(Debug)]
 pub struct Refinement {
     path: Vec<State>,
-    /// Which end the path leads to.
+    /// Index of the path's end.
     end: usize,
     ends: Vec<End>,
     measure: Measure,
-    /// Of the path and what follows it, as it is measured.
+    /// Cost of the path and of what follows it, by the measure.
     cost: f32,
-    /// Whether that has regard to the room that there is for blends.
+    /// Whether the cost accounts for the room that blends have.
     is_certain: bool,
     constraint: Option<Constraint>,
     random: ChaCha8Rng,
     shares: Shares,
     tree: Option<RrtStar>,
-    /// What the tree has taken in last.
+    /// The path that the tree adopted last.
     adopted: Vec<State>,
 }
 
@@ -118,13 +117,13 @@ impl Refinement {
         new
     }
 
-    /// With other shares; their sum is not zero.
+    /// Sets the shares; their sum must not be zero.
     #[must_use]
     pub fn with_shares(self, shares: Shares) -> Refinement {
         Refinement { shares, ..self }
     }
 
-    /// Of a path that keeps a constraint, and goes on keeping it.
+    /// Improves a path under a constraint; all later paths satisfy it, too.
     #[must_use]
     pub fn keeping(self, constraint: Constraint) -> Refinement {
         Refinement { constraint: Some(constraint), shares: Shares::CONSTRAINED, ..self }
@@ -140,22 +139,22 @@ impl Refinement {
         self.end
     }
 
-    /// Where it may end.
+    /// The possible ends.
     pub fn ends(&self) -> &[End] {
         &self.ends
     }
 
-    /// Allows for one more end.
+    /// Adds a possible end.
     pub fn add(&mut self, end: End) {
         self.ends.push(end);
     }
 
-    /// The length of the path and of what follows it, in radians.
+    /// Length of the path and of what follows it, in radians.
     pub fn length(&self) -> f32 {
         path_length(&self.path) + self.ends[self.end].rest
     }
 
-    /// What is made less: that length, or about how long both take, in seconds.
+    /// The cost that is minimised: that length, or the estimated duration of both, in seconds.
     pub fn cost(&self) -> f32 {
         self.cost
     }
@@ -185,11 +184,11 @@ impl Refinement {
         self.measured(path) + self.rest(&self.ends[end])
     }
 
-    /// As [`Refinement::cost_of`], with blends as wide as there is room for.
+    /// As [`Refinement::cost_of`], with blends only as wide as there is room for.
     fn certain_cost_of(&mut self, space: &mut Space, path: &[State], end: usize) -> f32 {
         let rest = self.rest(&self.ends[end]);
         match &mut self.measure {
-            // Along a constraint there is no room to tell of: the path is smoothed as a whole.
+            // Along a constraint no room for blends is computed: the path is smoothed as a whole.
             Measure::Duration(rough) if self.constraint.is_none() => {
                 rough.duration_among_s(path, &mut |from, to| space.is_free_motion(from, to)) as f32 + rest
             }
@@ -197,12 +196,12 @@ impl Refinement {
         }
     }
 
-    /// Whether a path would be better if there was room for every blend.
+    /// Whether a path would be better if every blend had room.
     fn may_be_better(&mut self, path: &[State], end: usize) -> bool {
         self.cost_of(path, end) < self.cost - LEAST_GAIN
     }
 
-    /// Takes a path that is possible, if it is better.
+    /// Adopts a valid path, if it is better.
     fn take(&mut self, space: &mut Space, path: Vec<State>, end: usize) {
         if !self.may_be_better(&path, end) {
             return;
@@ -213,10 +212,10 @@ impl Refinement {
         }
     }
 
-    /// Tries one way to make the path better; some hundreds of microseconds at the most, unless `control` ends it before.
+    /// Tries one way to improve the path. Takes some hundreds of microseconds at most, unless `control` ends it before.
     ///
     /// # Errors
-    /// What `control` said, when that was not to go on; the path is whole all the same.
+    /// The answer of `control` that ended the step; the path stays valid.
     pub fn step(&mut self, space: &mut Space, control: &mut dyn FnMut(usize) -> Control) -> Result<(), Control> {
         if !self.is_certain {
             self.cost = self.certain_cost_of(space, &self.path.clone(), self.end);
@@ -241,8 +240,8 @@ impl Refinement {
         self.grow_tree(space, control)
     }
 
-    /// The postures from one, which is left out, to another on the straight motion, or as straight as the constraint allows; none where
-    /// something is in the way.
+    /// The postures of the straight motion between two postures, without the first one, or as straight as the constraint allows; none if there is
+    /// a collision.
     fn motion(
         &self,
         space: &mut Space,
@@ -257,7 +256,7 @@ impl Refinement {
         Ok(steps.last().is_some_and(|last| last == to).then_some(steps))
     }
 
-    /// A point of the path so far along it, and the index of the posture that follows it.
+    /// The point of the path at a length along it, and the index of the posture that follows.
     pub fn point(&self, along: f32) -> (State, usize) {
         let mut left = along;
         for (i, pair) in self.path.windows(2).enumerate() {
@@ -271,7 +270,7 @@ impl Refinement {
         (self.path[last], last)
     }
 
-    /// The path up to a point of it, along some motions, and on from another point.
+    /// The path up to a point of it, through the postures `between`, and on from another point.
     fn detour(&self, (from, before): (State, usize), between: &[State], after: usize) -> Vec<State> {
         let mut path = self.path[..before].to_vec();
         path.push(from);
@@ -281,7 +280,7 @@ impl Refinement {
         path
     }
 
-    /// How far along the path two random points of it are, the first one first.
+    /// Two random lengths along the path, the smaller one first.
     fn stretch(&mut self) -> (f32, f32) {
         let whole = path_length(&self.path);
         let (a, b) = (self.random.random_range(0.0..=1.0) * whole, self.random.random_range(0.0..=1.0) * whole);
@@ -295,7 +294,7 @@ impl Refinement {
         }
         let (low, high) = self.stretch();
         let ((from, after_from), (to, after_to)) = (self.point(low), self.point(high));
-        // Along a constraint it gets no better than the straight motion.
+        // A motion along a constraint is never shorter than the straight one.
         let straight = self.detour((from, after_from), &[to], after_to);
         if after_from == after_to || !self.may_be_better(&straight, self.end) {
             return Ok(());
@@ -306,7 +305,7 @@ impl Refinement {
         Ok(())
     }
 
-    /// Moves a random corner towards a straight motion past it.
+    /// Moves a random corner towards the straight motion past it.
     fn move_corner(&mut self, space: &mut Space) -> Result<(), Control> {
         if self.path.len() < 3 {
             return Ok(());
@@ -326,7 +325,7 @@ impl Refinement {
         Ok(())
     }
 
-    /// Leads a random part of the path over a posture towards the straight motion, along the constraint.
+    /// Moves a random part of the path towards the straight motion, along the constraint.
     fn pull(&mut self, space: &mut Space, control: &mut dyn FnMut(usize) -> Control) -> Result<(), Control> {
         let (low, high) = self.stretch();
         let ((from, after_from), (to, after_to)) = (self.point(low), self.point(high));
@@ -347,7 +346,7 @@ impl Refinement {
         Ok(())
     }
 
-    /// A posture beside another, within the limits.
+    /// A random posture near another one, within the limits.
     fn aside(&mut self, space: &Space, posture: &State, stray: f32) -> State {
         let (lower, upper) = space.limits();
         let mut moved = *posture;
@@ -357,7 +356,7 @@ impl Refinement {
         moved
     }
 
-    /// Leaves the path somewhere for another end.
+    /// Leaves the path at a random point for another end.
     fn turn(&mut self, space: &mut Space, control: &mut dyn FnMut(usize) -> Control) -> Result<(), Control> {
         let other = self.random.random_range(0..self.ends.len());
         let along = self.random.random_range(0.0..=1.0) * path_length(&self.path);
@@ -376,7 +375,7 @@ impl Refinement {
         Ok(())
     }
 
-    /// How long a path may be that is better, what follows it included.
+    /// Maximum length of a better path, including what follows it.
     fn bound(&self) -> f32 {
         match self.measure {
             Measure::Length => self.length(),
@@ -384,7 +383,7 @@ impl Refinement {
         }
     }
 
-    /// Searches from scratch where a better path could run.
+    /// A new search where a better path could run.
     fn search_again(&mut self, space: &mut Space, control: &mut dyn FnMut(usize) -> Control) -> Result<(), Control> {
         let bound = self.bound();
         let start = self.path[0];
@@ -417,7 +416,7 @@ impl Refinement {
         }
     }
 
-    /// Grows the tree of shortest ways, and follows it where it knows a better one.
+    /// Grows the RRT* tree, and adopts its path if that is better.
     fn grow_tree(&mut self, space: &mut Space, control: &mut dyn FnMut(usize) -> Control) -> Result<(), Control> {
         let bound = self.bound();
         let tree = self.tree.get_or_insert_with(|| RrtStar::new(&self.path[0], space.joints()));

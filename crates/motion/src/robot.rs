@@ -466,14 +466,14 @@ impl Robot {
         Chain::to(link, &self.model.links, |link| link.moved_by(&self.arm.indices, &positions))
     }
 
-    /// The same with the joints that move the fingers.
+    /// As `arm_chain`, but the joints that move are those of the fingers.
     pub(crate) fn finger_chain(&self, configuration: &Configuration, link: usize) -> Chain {
         let positions = self.positions(configuration);
         let indices: &[usize] = self.finger.as_ref().map_or(&[], |finger| &finger.indices);
         Chain::to(link, &self.model.links, |link| link.moved_by(indices, &positions))
     }
 
-    /// The limits of what moves the fingers; none of a robot without a gripper.
+    /// The limits of the joints that move the fingers; none for a robot without a gripper.
     pub(crate) fn finger_joints(&self) -> &[Joint] {
         self.finger.as_ref().map_or(&[], |finger| &finger.joints)
     }

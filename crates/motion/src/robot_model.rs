@@ -1,10 +1,9 @@
-//! The one model of a robot: a tree of links from its URDF, the joints that move them, the shapes that can collide, and the pairs
-//! of links that its SRDF excepts from checks, or that are made to touch where there is none.
+//! The model of a robot: a tree of links from its URDF, the joints that move them, the shapes that can collide, and the pairs of links that are
+//! excepted from checks by the SRDF or, without one, because they are built to touch.
 //!
-//! A joint that mimics another, also through further mimics, has no position of its own: its link is driven by the joint at the end of the
-//! chain, by a factor; the offset is part of where the link is mounted. A [`RobotState`] has a
-//! position for each joint of the model. What is planned for is a [`Mechanism`]: the same links, moved by some of the joints, with the
-//! others held where a state has them.
+//! A joint that mimics another, also through further mimics, has no position of its own: its link is driven by the joint at the end of the chain,
+//! by a factor; the offset is part of the link's origin. A [`RobotState`] has a position for each joint of the model. A [`Mechanism`] is what is
+//! planned for: the same links, moved by some of the joints, with the others held where a state has them.
 
 mod srdf;
 
@@ -21,18 +20,18 @@ use ratn_model::pose::Pose;
 use std::collections::{BTreeMap, BTreeSet};
 use std::f64::consts::TAU;
 
-/// How far apart the limits of a joint that is planned for may be, in radians (metres for one that slides).
+/// Maximum range of a planned joint, in radians (metres for a prismatic joint).
 const WIDEST: f64 = 1e4;
 
-/// How many turns from zero a joint that turns without end may be.
+/// Maximum number of turns from zero of a continuous joint.
 pub(crate) const MOST_TURNS: f64 = 1e4;
 
 const FOR_ENDLESS: &str = "a joint that turns without end is `continuous`";
 
-/// A robot.
+/// The model of a robot.
 #[derive(Debug, Clone)]
 pub struct RobotModel {
-    /// As in the URDF.
+    /// Name as in the URDF.
     pub name: String,
     /// Every joint that has a position of its own, in the order of the URDF. A joint's index here is its index in a state.
     pub joints: Vec<Joint>,
@@ -40,53 +39,53 @@ pub struct RobotModel {
     pub links: Vec<Link>,
     /// The names of the joints that mimic others.
     pub(crate) mimics: BTreeSet<String>,
-    /// Where its joints are in the URDF.
+    /// Positions of its joints in the text of the URDF.
     pub(crate) texts: BTreeMap<String, JointText>,
-    /// What the SRDF says of pairs of links, or, without one, what follows from how they meet ([`pairs`]).
+    /// The checks of pairs of links, from the SRDF or, without one, from how the links touch ([`pairs`]).
     pub(crate) checks: Checks,
     /// Whether an SRDF excepts pairs of links from checks.
     has_exceptions: bool,
 }
 
-/// A joint and its limits (radians, or metres for sliding joints).
+/// A joint and its limits (radians, or metres for prismatic joints).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Joint {
-    /// As in the URDF.
+    /// Name as in the URDF.
     pub name: String,
-    /// Least position; where the joint turns without end, that is where one turn of it begins, and no limit ([`Joint::limits`]).
+    /// Minimum position. For a continuous joint this is where one turn of it begins, and no limit ([`Joint::limits`]).
     pub lower: f64,
-    /// Greatest position, or where that turn ends.
+    /// Maximum position, or the end of that turn.
     pub upper: f64,
-    /// Whether it turns without end (`continuous` in the URDF): after a whole turn of it everything is where it was.
+    /// Whether it is continuous, as in the URDF: it turns without end, and after a whole turn everything is where it was.
     pub endless: bool,
-    /// Greatest speed, per second.
+    /// Maximum speed, per second.
     pub velocity: f64,
-    /// Greatest acceleration, per second squared.
+    /// Maximum acceleration, per second squared.
     pub acceleration: f64,
-    /// Greatest jerk, per second cubed.
+    /// Maximum jerk, per second cubed.
     pub jerk: f64,
 }
 
 /// A rigid link.
 #[derive(Debug, Clone)]
 pub struct Link {
-    /// As in the URDF.
+    /// Name as in the URDF.
     pub name: String,
-    /// The link it hangs on.
+    /// Its parent link.
     pub parent: Option<usize>,
-    /// Where its joint sits in the parent's frame.
+    /// The frame of its joint in the parent's frame.
     pub origin: Pose,
-    /// The joint that moves it.
+    /// The joint that moves it, if any.
     pub drive: Option<Drive>,
-    /// What can collide, exactly: primitives,
+    /// Its exact shapes: primitives,
     pub bodies: Vec<Body>,
     /// and meshes.
     pub meshes: Vec<Meshed>,
-    /// How many of the bodies, the last ones, are spheres that stand for the meshes and hold them: all that needs primitives has these.
+    /// Number of bodies, at the end of the list, that are spheres which cover the meshes, for checks that need primitives.
     pub covers: usize,
-    /// How much larger its bodies are taken, in metres.
+    /// Padding of its bodies, in metres.
     pub padding_m: f64,
-    /// Spheres that hold all of it, padding included.
+    /// Spheres that hold all of it, including the padding.
     pub spheres: Vec<Sphere>,
 }
 
@@ -95,41 +94,40 @@ pub struct Link {
 pub struct Drive {
     /// Index of the joint.
     pub joint: usize,
-    /// Unit vector.
+    /// Unit vector of the joint's axis.
     pub axis: [f64; 3],
-    /// Along the axis instead of about it.
+    /// Whether the joint is prismatic: it moves the link along the axis instead of about it.
     pub slides: bool,
-    /// How far the link moves for one radian (or metre) of the joint: 1 but for a link whose own joint mimics.
+    /// Motion of the link for one radian (or metre) of the joint: 1, except for a link whose own joint is a mimic.
     pub factor: f64,
 }
 
 impl Joint {
-    /// The least and the greatest position at which it may be. One that turns without end may be so many turns from zero that numbers still have
-    /// the digits that a path needs.
+    /// Minimum and maximum position. A continuous joint may be so many turns from zero that numbers still have the digits that a path needs.
     pub fn limits(&self) -> [f64; 2] {
         if self.endless { [-MOST_TURNS * TAU, MOST_TURNS * TAU] } else { [self.lower, self.upper] }
     }
 
-    /// Whether it may be at a position, or is beyond its limits by no more than `beyond` there.
+    /// Whether a position is within the limits, or exceeds them by no more than `beyond`.
     pub fn allows(&self, position: f64, beyond: f64) -> bool {
         let [lower, upper] = self.limits();
         (lower - beyond..=upper + beyond).contains(&position)
     }
 
-    /// The nearest position at which it may be.
+    /// The nearest position within the limits.
     pub fn clamp(&self, position: f64) -> f64 {
         let [lower, upper] = self.limits();
         position.clamp(lower, upper)
     }
 
-    /// A position as the joint counts it when it is at another one: in the turn that is nearest, if it turns without end.
+    /// The equivalent of a position in the turn nearest to `from`, if the joint is continuous; otherwise the position itself.
     pub fn counted_from(&self, from: f64, position: f64) -> f64 {
         if self.endless { position + TAU * ((from - position) / TAU).round() } else { position }
     }
 }
 
 impl Drive {
-    /// Where the link is, as seen from its origin, when the joint is at a position.
+    /// The pose of the link relative to its origin at a position of the joint.
     #[inline]
     pub fn moved(&self, position: f64) -> Pose {
         let position = self.factor * position;
@@ -158,12 +156,12 @@ impl Link {
         }
     }
 
-    /// Its primitives without the spheres that stand for its meshes. With the meshes they are its exact shape.
+    /// Its primitives without the spheres that cover its meshes. Together with the meshes they are its exact shape.
     pub fn own_bodies(&self) -> &[Body] {
         &self.bodies[..self.bodies.len() - self.covers]
     }
 
-    /// Has spheres stand for its meshes from now on.
+    /// Adds spheres that cover its meshes.
     fn cover_meshes(&mut self) {
         let spheres = self
             .meshes
@@ -175,8 +173,8 @@ impl Link {
         self.covers = self.bodies.len() - before;
     }
 
-    /// Where it sits in its parent's frame, and what moves it there, where some joints move and the others stay where `positions` has them;
-    /// the joint's index is that among those that move.
+    /// Its origin in its parent's frame, and its drive, if only the joints `moving` move and the others stay at `positions`. The joint's index is
+    /// that among the moving ones.
     pub(crate) fn moved_by(&self, moving: &[usize], positions: &[f64]) -> (Pose, Option<Drive>) {
         let Some(drive) = self.drive else { return (self.origin, None) };
         match moving.iter().position(|joint| *joint == drive.joint) {
@@ -185,7 +183,7 @@ impl Link {
         }
     }
 
-    /// Where it is in its parent's frame.
+    /// Its pose in its parent's frame.
     #[inline]
     pub(crate) fn in_parent(&self, positions: &[f64]) -> Pose {
         match self.drive {
@@ -195,7 +193,7 @@ impl Link {
     }
 }
 
-/// Poses of links, of which parents come before children, in the frame of the root; `positions` in the order of the joints.
+/// Poses of links, parents before children, in the frame of the root; `positions` in the order of the joints.
 pub(crate) fn poses(links: &[Link], positions: &[f64]) -> Vec<Pose> {
     let mut poses: Vec<Pose> = Vec::with_capacity(links.len());
     for link in links {
@@ -215,7 +213,7 @@ impl RobotModel {
         RobotModel::read_with_meshes(urdf, srdf, &mut { nowhere })
     }
 
-    /// As [`RobotModel::read`]; `load` gives what is in the mesh file that the URDF names so
+    /// As [`RobotModel::read`]; `load` returns the content of a mesh file by the name in the URDF
     /// ([`MeshFiles::read`](crate::mesh_files::MeshFiles::read)).
     ///
     /// # Errors
@@ -228,8 +226,8 @@ impl RobotModel {
         RobotModel::of(urdf::read(urdf, load)?, srdf)
     }
 
-    /// As [`RobotModel::read_with_meshes`], with spheres that hold each mesh beside it, for whatever knows primitives alone. Which pairs are checked
-    /// is what the meshes say.
+    /// As [`RobotModel::read_with_meshes`], with spheres that cover each mesh in addition, for code that handles only primitives. The meshes
+    /// decide which pairs are checked.
     pub(crate) fn read_with_covers(
         urdf: &str,
         srdf: Option<&str>,
@@ -237,8 +235,8 @@ impl RobotModel {
     ) -> Result<RobotModel, MechanismError> {
         let mut model = RobotModel::read_with_meshes(urdf, srdf, load)?;
         if !model.has_exceptions {
-            // Such spheres forbid no more than they did, and the search sees them: of pairs with meshes only those go by their shapes of which spheres
-            // leave hardly anything.
+            // The spheres are no larger than before, and the search sees them: so of the pairs with meshes only those are checked by their shapes
+            // that the spheres block almost everywhere.
             let undecided = pairs::undecided(&model, &model.checks.excepted);
             let has_mesh = |(a, b): &Pair| [*a, *b].iter().any(|link| !model.links[*link].meshes.is_empty());
             model.checks.by_shapes.retain(|pair| !has_mesh(pair) || undecided.contains(pair));
@@ -247,10 +245,10 @@ impl RobotModel {
         Ok(model)
     }
 
-    /// Links and joints without shapes, and nothing of what is checked: all that can be said before a mesh is read.
+    /// Links and joints without shapes and without checks: all that is known before a mesh is read.
     ///
     /// # Errors
-    /// As [`RobotModel::read_with_meshes`], but for what is wrong with meshes.
+    /// As [`RobotModel::read_with_meshes`], except for errors of meshes.
     pub(crate) fn outline(urdf: &str, srdf: Option<&str>) -> Result<RobotModel, MechanismError> {
         let Description { name, joints, links, mimics, texts } = urdf::read_outline(urdf)?;
         let excepted = srdf.map_or_else(|| Ok(BTreeSet::new()), |text| srdf::excepted(text, &links))?;
@@ -263,7 +261,7 @@ impl RobotModel {
         let excepted = srdf.map_or_else(|| Ok(BTreeSet::new()), |text| srdf::excepted(text, &links))?;
         let has_exceptions = !excepted.is_empty();
         let mut model = RobotModel { name, joints, links, mimics, texts, checks: Checks::default(), has_exceptions };
-        // An SRDF may say nothing but groups of joints and postures.
+        // An SRDF may have only groups of joints and postures.
         model.checks = if has_exceptions { pairs::beside_srdf(&model, excepted) } else { pairs::checks(&model) };
         Ok(model)
     }
@@ -278,12 +276,12 @@ impl RobotModel {
         self.joints.iter().position(|joint| joint.name == name)
     }
 
-    /// Poses of all links in the frame of the root; a position for each joint.
+    /// Poses of all links in the frame of the root; `positions` has one for each joint.
     pub fn poses(&self, positions: &[f64]) -> Vec<Pose> {
         poses(&self.links, positions)
     }
 
-    /// Recomputes in place the poses of some links, parents before children; those of their parents hold.
+    /// Recomputes in place the poses of some links, parents before children; the poses of their parents must be current.
     #[inline]
     pub fn update(&self, links: &[usize], positions: &[f64], poses: &mut [Pose]) {
         for &index in links {
@@ -293,12 +291,12 @@ impl RobotModel {
         }
     }
 
-    /// What is checked of pairs of links.
+    /// The checks of pairs of links.
     pub fn checks(&self) -> &Checks {
         &self.checks
     }
 
-    /// Whether an SRDF excepts pairs of its links from checks. Without any, [`pairs`] finds out.
+    /// Whether an SRDF excepts pairs of links from checks. If not, [`pairs`] finds the exceptions.
     pub fn has_exceptions(&self) -> bool {
         self.has_exceptions
     }
@@ -308,12 +306,12 @@ impl RobotModel {
         a == b || self.checks.excepted.contains(&(a.min(b), a.max(b)))
     }
 
-    /// Whether two links are told apart by their exact shapes, because the spheres that hold them say nothing of them.
+    /// Whether two links are checked by their exact shapes, because the spheres that hold them cannot decide.
     pub fn is_by_shapes(&self, a: usize, b: usize) -> bool {
         self.checks.by_shapes.contains(&(a.min(b), a.max(b)))
     }
 
-    /// What is planned for: `joints`, in this order, without any all of them; the others stay where `state` has them.
+    /// The mechanism of the planned `joints`, in this order, or of all joints if there are none given; the others stay at `state`.
     ///
     /// # Errors
     /// [`MechanismError`] names a joint that cannot be planned for.
@@ -335,12 +333,12 @@ impl RobotModel {
         Ok(self.restricted(&planned, state.positions()))
     }
 
-    /// As [`RobotModel::planned`], of joints that can be, by their indices.
+    /// As [`RobotModel::planned`], for plannable joints given by their indices.
     pub(crate) fn restricted(&self, planned: &[usize], positions: &[f64]) -> Mechanism {
         self.moved_by(planned, positions, self.checks.clone())
     }
 
-    /// The links moved by some joints, the others where `positions` has them.
+    /// The mechanism of the links moved by the joints `planned`, with the others at `positions`.
     pub(crate) fn moved_by(&self, planned: &[usize], positions: &[f64], checks: Checks) -> Mechanism {
         let held = |link: &Link| {
             let (origin, drive) = link.moved_by(planned, positions);

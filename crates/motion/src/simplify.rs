@@ -1,26 +1,26 @@
-//! Makes a path shorter and rounder: shortcuts over its vertices, then its corners cut (Chaikin's refinement, CGIP 1974, whose
-//! limit is the quadratic B-spline), every new motion validated, parts of validated motions taken as validated, and nothing that was
-//! found not to be free tried again. In the end the whole is made sure of between its postures too.
+//! Path simplification: shortcuts over the vertices of a path, then corners cut (Chaikin's refinement, CGIP 1974, whose limit is the quadratic
+//! B-spline). Every new motion is validated, parts of validated motions count as validated, and nothing found in collision is tried again. At the
+//! end the whole path is also made free between its postures.
 
 use crate::connect::{Budget, ConnectError, connect, mend};
 use crate::pace::Control;
 use crate::space::{Space, State, between, distance};
 
-/// Rounds of cutting at the most.
+/// Maximum number of rounds of cutting.
 const ROUNDS: usize = 6;
 
-/// Motions validated at the most. Shortcuts over the thirty vertices of a long path take some four hundred; most are not free, and found so at
-/// once.
+/// Maximum number of motions validated. Shortcuts over the thirty vertices of a long path take some four hundred; most are in collision, and found
+/// so at once.
 const MAX_CHECKS: usize = 1000;
 
-/// A cut that saves less than this part of the whole is not tried, and a round that saves less is the last.
+/// A cut that saves less than this fraction of the length is not tried, and a round that saves less is the last.
 const LEAST_CUT: f32 = 0.003;
 const LEAST_SAVING: f32 = 0.002;
 
-/// A vertex is left out where the straight motion past it is shorter by no more than this, in radians: the path does not bend there.
+/// A vertex is dropped if the straight motion past it is shorter by no more than this, in radians: the path has no bend there.
 const STRAIGHT: f32 = 1e-4;
 
-/// Shares of the shorter side that a corner is cut at.
+/// Fractions of the shorter side at which a corner is cut.
 const SHARES: [f32; 3] = [1.0, 0.5, 0.25];
 
 /// The length of a path, in radians.
@@ -31,8 +31,8 @@ pub fn path_length(path: &[State]) -> f32 {
 /// A shorter path with the same ends, free also between its postures.
 ///
 /// # Errors
-/// As [`mend`]: where what was found is not free between its postures and cannot be mended, or the caller stopped it there.
-/// Stopped earlier, the path is as short as it was then.
+/// As [`mend`]: if the path found is not free between its postures and cannot be mended, or the caller stopped it there. If stopped earlier, the
+/// path is as short as it was then.
 pub fn simplify(
     space: &mut Space,
     path: &[State],
@@ -46,7 +46,7 @@ pub fn simplify(
         Ok(mended) if mended.len() > short.len() => return shortened_swept(space, &mended, control),
         other => return other,
     }
-    // The short way leads through a gap that is none. The long one may not, and another search looks between postures.
+    // The short path leads through a gap that does not exist. The long one may not, and another search checks between postures.
     let long = match mend(space, path, budget, control) {
         Err(ConnectError::Exhausted { .. }) => {
             space.set_swept(true);
@@ -70,7 +70,7 @@ fn shortened_swept(
     short
 }
 
-/// As [`simplify`], as sure of what is between the postures as the space is.
+/// As [`simplify`], but checks between the postures only if the space does.
 pub(crate) fn shortened(
     space: &mut Space,
     path: &[State],
@@ -93,7 +93,7 @@ pub(crate) fn shortened(
     Ok(work.path.into_iter().map(|vertex| vertex.state).collect())
 }
 
-/// The same path without the vertices on straight motions, as a search that grows by steps leaves them.
+/// The same path without the vertices on straight motions, which a search in steps leaves.
 fn without_straight(path: &[State]) -> Vec<State> {
     let mut kept = vec![path[0]];
     for pair in path[1..].windows(2) {
@@ -107,23 +107,23 @@ fn without_straight(path: &[State]) -> Vec<State> {
     kept
 }
 
-/// How much shorter the straight motion from `a` to `b` is than that over `v`.
+/// How much shorter the straight motion from `a` to `b` is than that through `v`.
 fn saving(a: &State, v: &State, b: &State) -> f32 {
     distance(a, v) + distance(v, b) - distance(a, b)
 }
 
-/// A vertex, and what is known not to be free about it as long as its neighbours stay.
+/// A vertex, and which motions around it are known to be in collision as long as its neighbours stay.
 #[derive(Clone)]
 struct Vertex {
     state: State,
-    /// The straight motion between its neighbours.
+    /// Whether the straight motion between its neighbours is known to be in collision.
     is_needed: bool,
-    /// Every cut that saves enough.
+    /// Whether every cut that saves enough is known to be in collision.
     is_sharp: bool,
 }
 
 impl Vertex {
-    /// Shortcuts leave no vertex that could be left out.
+    /// After shortcuts no vertex can be dropped.
     fn after_shortcuts(state: State) -> Vertex {
         Vertex { state, is_needed: true, is_sharp: false }
     }
@@ -146,7 +146,7 @@ impl Work<'_> {
         self.path.windows(2).map(|pair| distance(&pair[0].state, &pair[1].state)).sum()
     }
 
-    /// A vertex between its neighbours.
+    /// A vertex with its neighbours.
     fn corner(&self, at: usize) -> (State, State, State) {
         (self.path[at - 1].state, self.path[at].state, self.path[at + 1].state)
     }
@@ -163,9 +163,9 @@ impl Work<'_> {
         self.space.is_free_motion(from, to)
     }
 
-    /// Puts others in the place of a vertex; its neighbours get new ones.
+    /// Replaces a vertex by others; its neighbours get new neighbours.
     fn replace(&mut self, at: usize, new: &[State]) {
-        // One that takes its place has the same neighbours.
+        // A single replacement has the same neighbours.
         let is_needed = new.len() == 1 && self.path[at].is_needed;
         self.path.splice(at..=at, new.iter().map(|state| Vertex { state: *state, is_needed, is_sharp: false }));
         for neighbour in [at - 1, at + new.len()] {
@@ -173,7 +173,7 @@ impl Work<'_> {
         }
     }
 
-    /// From each vertex as far as a straight motion leads.
+    /// From each vertex, takes the longest free straight motion.
     fn shorten(&mut self) {
         let mut from = 0;
         while from + 2 < self.path.len() {
@@ -188,7 +188,7 @@ impl Work<'_> {
         }
     }
 
-    /// Leaves out vertices between whose neighbours the straight motion is free.
+    /// Drops vertices whose neighbours have a free straight motion between them.
     fn shorten_neighbours(&mut self) {
         let mut middle = 1;
         while middle + 1 < self.path.len() {
@@ -203,7 +203,7 @@ impl Work<'_> {
         }
     }
 
-    /// Replaces corners by shorter ones.
+    /// Replaces corners by shorter ways.
     fn cut_corners(&mut self) {
         let least = LEAST_CUT * self.length();
         let mut middle = 1;
@@ -221,7 +221,7 @@ impl Work<'_> {
         }
     }
 
-    /// What a vertex is replaced by where it is cut, if that is free; a cut that reaches a neighbour leaves no new vertex there.
+    /// The replacement of a vertex by a cut, if that is free; a cut that reaches a neighbour leaves no new vertex there.
     fn cut(&mut self, at: usize, least: f32) -> Option<Vec<State>> {
         let (a, v, b) = self.corner(at);
         let (before, after) = (distance(&a, &v), distance(&v, &b));

@@ -1,16 +1,16 @@
-//! Evenly spread samples: the Sobol' sequence in the order of the Gray code (Antonov and Saleev 1979), with the direction numbers of Joe and
-//! Kuo (2008), shifted digit by digit by a seed. One sample is one exclusive or for all joints together.
+//! Evenly spread samples: the Sobol' sequence in Gray code order (Antonov and Saleev 1979), with the direction numbers of Joe and Kuo (2008) and a
+//! random digital shift by a seed. One sample takes one exclusive or for all joints together.
 
 use crate::mechanism::MAX_JOINTS;
 use crate::space::State;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Digits of a coordinate, in base 2.
+/// Binary digits of a coordinate.
 const DIGITS: usize = 32;
 
-/// Per joint from the second on: the degree of its primitive polynomial, the polynomial's inner coefficients as bits, and the first
-/// direction numbers.
+/// For each joint from the second on: the degree of its primitive polynomial, the polynomial's inner coefficients as bits, and the first direction
+/// numbers.
 const POLYNOMIALS: [(usize, u32, [u32; 6]); MAX_JOINTS - 1] = [
     (1, 0, [1, 0, 0, 0, 0, 0]),
     (2, 1, [1, 3, 0, 0, 0, 0]),
@@ -29,10 +29,10 @@ const POLYNOMIALS: [(usize, u32, [u32; 6]); MAX_JOINTS - 1] = [
     (6, 16, [1, 3, 1, 13, 27, 49]),
 ];
 
-/// All digits of a coordinate are worth this together.
+/// Factor that converts the upper 24 digits of a coordinate to a number below 1.
 const WORTH: f32 = 1.0 / (1 << 24) as f32;
 
-/// What each digit of the counter changes in the coordinates.
+/// For each digit of the counter, what it changes in the coordinates.
 static DIRECTIONS: [[u32; MAX_JOINTS]; DIGITS] = directions();
 
 const fn directions() -> [[u32; MAX_JOINTS]; DIGITS] {
@@ -79,7 +79,7 @@ impl Sobol {
         Sobol { index: 0, digits: std::array::from_fn(|_| random.random_range(0..=u32::MAX)) }
     }
 
-    /// The next sample between the limits.
+    /// The next sample, within the limits.
     #[inline]
     pub(crate) fn next(&mut self, lower: &State, upper: &State) -> State {
         let mut state = [0.0; MAX_JOINTS];
@@ -92,7 +92,7 @@ impl Sobol {
         state
     }
 
-    /// Takes back so many samples, which come next then.
+    /// Takes back the last `count` samples, which come next again.
     pub(crate) fn take_back(&mut self, count: usize) {
         for _ in 0..count {
             self.index = self.index.wrapping_sub(1);
@@ -100,10 +100,10 @@ impl Sobol {
         }
     }
 
-    /// Changes what differs between the sample of this index and the next one.
+    /// Applies the difference between the sample of this index and the next one.
     #[inline]
     fn change(&mut self) {
-        // After all samples of 32 digits it begins anew.
+        // After 2^32 samples the sequence begins anew.
         let changed = self.index.trailing_ones() as usize % DIGITS;
         for (digits, direction) in self.digits.iter_mut().zip(&DIRECTIONS[changed]) {
             *digits ^= direction;

@@ -1,4 +1,4 @@
-//! A shape as the exact checks see it: what has an inside is solid, and all that is within its skin counts as the shape.
+//! A shape as the exact checks see it: a closed shape is solid, and all points within its skin count as part of it.
 
 use crate::distance;
 use crate::geometry::Body;
@@ -12,13 +12,13 @@ use std::sync::Arc;
 #[derive(Debug, Clone)]
 pub(crate) struct Solid {
     pub(crate) shape: SharedShape,
-    /// How near to it is as good as touching, in metres.
+    /// Thickness of the skin in metres: what is nearer counts as touching.
     pub(crate) skin_m: f64,
-    /// Of a mesh; other shapes are solid by themselves.
+    /// The inside of a mesh; other shapes are solid by themselves.
     pub(crate) inside: Option<Arc<Inside>>,
 }
 
-/// A shape in its place.
+/// A shape with its pose.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Placed<'s> {
     pub(crate) pose: Pose32,
@@ -26,12 +26,12 @@ pub(crate) struct Placed<'s> {
 }
 
 impl Solid {
-    /// A primitive, larger on every side.
+    /// A primitive, padded on every side.
     pub(crate) fn primitive(body: &Body, padding_m: f64) -> Solid {
         Solid { shape: body.geometry.shape(padding_m), skin_m: 0.0, inside: None }
     }
 
-    /// A mesh, larger on every side.
+    /// A mesh, padded on every side.
     pub(crate) fn mesh(mesh: &Mesh, padding_m: f64) -> Solid {
         let (shape, inside) = mesh.solid();
         Solid { shape, skin_m: padding_m, inside: Some(inside) }
@@ -44,14 +44,13 @@ impl Placed<'_> {
         self.gap(other, 0.0) <= 0.0 || self.enclosed_m(other).is_some()
     }
 
-    /// How deep two shapes are in each other, in metres, if they touch or one is inside the other.
+    /// Penetration of two shapes in metres, if they touch or one is inside the other.
     pub(crate) fn depth(&self, other: &Placed<'_>) -> Option<f64> {
         let apart = self.apart_m(other, 0.0);
         (apart <= 0.0).then_some(-apart)
     }
 
-    /// How far two shapes are from each other, in metres, something greater than `enough_m` where that is more; where they touch, as far below
-    /// zero as they are deep in each other.
+    /// Distance of two shapes in metres, or any value greater than `enough_m` if it is more than that. Negative: the penetration.
     pub(crate) fn apart_m(&self, other: &Placed<'_>, enough_m: f64) -> f64 {
         let gap = self.gap(other, enough_m);
         let skin_m = self.solid.skin_m + other.solid.skin_m;
@@ -64,21 +63,21 @@ impl Placed<'_> {
         -distance::depth(&self.pose, &*self.solid.shape, &other.pose, &*other.solid.shape) - skin_m
     }
 
-    /// Between the surfaces of the skins.
+    /// Distance between the outer surfaces of the skins.
     fn gap(&self, other: &Placed<'_>, enough_m: f64) -> f64 {
         let skin_m = self.solid.skin_m + other.solid.skin_m;
         let (shape, its) = (&*self.solid.shape, &*other.solid.shape);
         distance::gap(&self.pose, shape, &other.pose, its, enough_m + skin_m).map_or(-skin_m, |gap| gap - skin_m)
     }
 
-    /// How deep one is wholly inside the other.
+    /// Penetration if one shape is wholly inside the other.
     fn enclosed_m(&self, other: &Placed<'_>) -> Option<f64> {
         let meshes = self.solid.inside.is_some() || other.solid.inside.is_some();
-        // The distance knows only the surface of a mesh.
+        // The distance considers only the surface of a mesh.
         if meshes { self.depth_inside(other).or_else(|| other.depth_inside(self)) } else { None }
     }
 
-    /// How deep this is in another shape whose surface it does not meet: as deep as the deepest of its parts, by a point of each.
+    /// Penetration in another shape whose surface it does not touch: that of its deepest part, by one point of each part.
     fn depth_inside(&self, other: &Placed<'_>) -> Option<f64> {
         let centre = [[0.0; 3]];
         let points = self.solid.inside.as_ref().map_or(&centre[..], |inside| inside.corners());
@@ -107,7 +106,7 @@ mod tests {
         let floor = solid(SharedShape::new(HalfSpace::new(Vector::new(0.0, 0.0, 1.0))));
         let ball = solid(SharedShape::ball(0.1));
         let at = |solid, z: f32| Placed { pose: Pose32::from_translation(Vector::new(0.0, 0.0, z)), solid };
-        // parry3d says nothing about two half-spaces.
+        // parry3d gives no answer for two half-spaces.
         assert!(at(&floor, 1.0).touches(&at(&floor, 0.0)));
         assert!(at(&ball, 0.05).touches(&at(&floor, 0.0)));
         assert!(!at(&ball, 0.2).touches(&at(&floor, 0.0)));

@@ -1,10 +1,9 @@
-//! A robot among obstacles, made ready for the vector kernels: which postures and straight motions are free.
+//! A robot among obstacles, compiled for the vector kernels: which postures and straight motions are free of collisions.
 //!
-//! Two ways to check a motion. [`Space::is_free_motion`] looks at [`Space::RESOLUTION`] postures per radian, as the search
-//! does. [`Space::is_swept_free`] leaves nothing between the postures: each sphere is grown by how far it can move until the
-//! next one, and the parts where that is too much are cut finer, down to postures so close that what is between is noise. Finer parts are looked at
-//! beside what the coarser ones were near to, and nothing else.
-//! How far it can move is half of its step to the next posture, and what the curvature of its way allows beside that.
+//! There are two ways to check a motion. [`Space::is_free_motion`] checks [`Space::RESOLUTION`] postures per radian, as the search does.
+//! [`Space::is_swept_free`] is a continuous check: each sphere is enlarged by how far it can move until the next posture, and stretches where that
+//! is too much are divided, down to postures so close that what is between is noise. Finer stretches are checked only against what the coarser
+//! ones were near to. The enlargement is half of the sphere's step to the next posture, and what the curvature of its way allows in addition.
 
 use crate::branches;
 use crate::cloud::Cloud;
@@ -32,32 +31,32 @@ pub fn state(positions: &[f64]) -> State {
     state
 }
 
-/// Grown by this, the spheres hide the rounding of `f32`, in metres.
+/// Enlargement of the spheres that covers the rounding of `f32`, in metres.
 pub(crate) const ROUNDING_M: f64 = 2e-5;
 
-/// Bounding spheres are larger by this, in metres: what a sphere meets in single precision, its bounding sphere meets, too.
+/// Enlargement of bounding spheres, in metres: what a sphere touches in single precision, its bounding sphere touches, too.
 const COARSE_ROUNDING_M: f32 = 1e-5;
 
-/// How much finer each level of a swept check is than the one before, and how many levels there are. The second is as close as the postures of
+/// Refinement from one level of a swept check to the next, and the number of levels. The second level is as fine as the postures of
 /// [`Space::is_free_motion`].
 const FINER: usize = 4;
 const LEVELS: usize = simd::DEPTH;
 
-/// For a look at everything.
+/// For a check against everything.
 const ALL: Among = Among { depth: 0, lanes: 0 };
 
-/// Points of a cloud that is joined with others at the most.
+/// Maximum number of points of a cloud that is joined with others.
 const SMALL_CLOUD: usize = 1_000;
 
-/// Postures of the widest batch.
+/// Number of postures of the widest batch.
 pub(crate) const WIDEST: usize = 16;
 
-/// Something that stands still.
+/// An obstacle, which does not move.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Obstacle {
-    /// For messages.
+    /// Its name in messages.
     pub name: String,
-    /// Its centre; axes along z.
+    /// The pose of its centre; its axis is along z.
     pub pose: Pose,
     /// Its shape.
     pub geometry: Geometry,
@@ -71,21 +70,21 @@ pub struct Space {
     isa: Isa,
     lower: State,
     upper: State,
-    /// How many times as closely motions of each joint are looked at ([`Mechanism::fineness`]).
+    /// Factor by which the motions of each joint are checked more closely ([`Mechanism::fineness`]).
     fineness: State,
     branches: Vec<Vec<usize>>,
-    /// A part that no joint moves stands in an obstacle.
+    /// Whether a link that no joint moves is in collision.
     blocked: bool,
     swept: bool,
-    /// What is told apart by exact shapes.
+    /// The couples that are checked by exact shapes.
     confirmed: Option<Arc<Confirmed>>,
 }
 
 impl Space {
-    /// Postures per radian of a motion that the search looks at; more where a link that mimics the joint goes further ([`Mechanism`]).
+    /// Postures per radian at which a motion is checked by the search; more if a link that mimics the joint moves further ([`Mechanism`]).
     pub const RESOLUTION: f32 = 32.0;
 
-    /// Postures per radian that are looked at by exact shapes where nothing is to be left between the postures.
+    /// Postures per radian at which exact shapes are checked if motions have to be free between their postures.
     pub(crate) const EXACT_RESOLUTION: f32 = 4.0 * Space::RESOLUTION;
 
     /// A robot among obstacles.
@@ -93,7 +92,7 @@ impl Space {
         Space::with_isa(mechanism, surroundings, Isa::detect())
     }
 
-    /// As [`Space::new`], with instructions that are not the widest.
+    /// As [`Space::new`], with a given instruction set.
     pub fn with_isa<'a>(mechanism: &Mechanism, surroundings: impl Into<Surroundings<'a>>, isa: Isa) -> Space {
         let surroundings = surroundings.into();
         let obstacles = surroundings.obstacles;
@@ -145,37 +144,37 @@ impl Space {
         Space { compiled, scratch, isa, lower, upper, fineness, branches, blocked, swept: false, confirmed: None }
     }
 
-    /// How many joints there are.
+    /// Number of joints.
     pub fn joints(&self) -> usize {
         self.compiled.joints
     }
 
-    /// Least and greatest positions.
+    /// Minimum and maximum positions.
     pub fn limits(&self) -> (&State, &State) {
         (&self.lower, &self.upper)
     }
 
-    /// The joints that are moved by no joint of another arm ([`branches`](crate::branches)).
+    /// Groups of joints that are moved by no joint of another arm ([`branches`](crate::branches)).
     pub(crate) fn branches(&self) -> &[Vec<usize>] {
         &self.branches
     }
 
-    /// The instructions in use.
+    /// The instruction set in use.
     pub fn isa(&self) -> Isa {
         self.isa
     }
 
-    /// From now on [`Space::is_free_motion`] leaves nothing between the postures.
+    /// Sets whether [`Space::is_free_motion`] also checks between the postures.
     pub fn set_swept(&mut self, swept: bool) {
         self.swept = swept;
     }
 
-    /// From now on this is looked at, too, by exact shapes.
+    /// Adds a check by exact shapes.
     pub(crate) fn confirm(&mut self, confirmed: Confirmed) {
         self.confirmed = Some(Arc::new(confirmed));
     }
 
-    /// Whether it leaves nothing.
+    /// Whether motions are checked between the postures as well.
     pub fn is_swept(&self) -> bool {
         self.swept
     }
@@ -185,14 +184,14 @@ impl Space {
         (0..self.joints()).all(|j| self.lower[j] <= state[j] && state[j] <= self.upper[j])
     }
 
-    /// Whether a posture touches nothing.
+    /// Whether a posture is free of collisions.
     pub fn is_free(&mut self, state: &State) -> bool {
         !self.blocked
             && self.check(state, &[0.0; MAX_JOINTS], 1, ALL)
             && self.confirmed.as_ref().is_none_or(|confirmed| confirmed.is_free(state))
     }
 
-    /// Which of up to [`WIDEST`] postures touch something that was touched lately, a bit each.
+    /// The mask of up to [`WIDEST`] postures in which a recent contact occurs again.
     pub(crate) fn touching_again(&mut self, states: &[State]) -> u32 {
         let mut positions = [Block([0.0; WIDEST]); MAX_JOINTS];
         for (lane, state) in states.iter().enumerate() {
@@ -203,7 +202,7 @@ impl Space {
         self.isa.touching_again(&self.compiled, &positions, states.len(), &mut self.scratch)
     }
 
-    /// Whether a straight motion touches nothing; `from` itself is not looked at.
+    /// Whether a straight motion is free of collisions; `from` itself is not checked.
     #[inline]
     pub fn is_free_motion(&mut self, from: &State, to: &State) -> bool {
         if self.swept {
@@ -214,7 +213,7 @@ impl Space {
         !self.blocked && self.check(from, &delta, batches, ALL) && self.is_confirmed(from, to, Space::RESOLUTION)
     }
 
-    /// Whether what is told apart by exact shapes is apart along a straight motion, by so many postures per radian.
+    /// Whether the couples checked by exact shapes are free along a straight motion, at `per_radian` postures per radian.
     fn is_confirmed(&self, from: &State, to: &State, per_radian: f32) -> bool {
         let Some(confirmed) = &self.confirmed else { return true };
         let delta = difference(to, from);
@@ -222,10 +221,10 @@ impl Space {
         confirmed.is_free_motion(from, to, (length * per_radian).ceil().max(1.0) as usize)
     }
 
-    /// Whether a straight motion touches nothing, also between the postures.
+    /// Whether a straight motion is free of collisions, also between the postures.
     pub fn is_swept_free(&mut self, from: &State, to: &State) -> bool {
         let delta = difference(to, from);
-        // What is wrong at all is mostly found by the coarse look.
+        // The coarse check finds most collisions.
         let batches = self.batches(&delta);
         !self.blocked
             && self.check(from, &delta, batches, ALL)
@@ -233,12 +232,12 @@ impl Space {
             && self.is_confirmed(from, to, Space::EXACT_RESOLUTION)
     }
 
-    /// One batch of postures along a motion; what the measurements time.
+    /// Checks one batch of postures along a motion; for benchmarks.
     pub fn check_batch(&mut self, from: &State, delta: &State) -> bool {
         self.check(from, delta, 1, ALL)
     }
 
-    /// As [`Space::is_swept_free`], for a motion whose postures were looked at before.
+    /// As [`Space::is_swept_free`], for a motion whose postures have been checked before.
     pub(crate) fn is_swept_free_too(&mut self, from: &State, to: &State) -> bool {
         !self.blocked && self.sweep(from, &difference(to, from)) && self.is_confirmed(from, to, Space::EXACT_RESOLUTION)
     }
@@ -248,7 +247,7 @@ impl Space {
         self.sweep_among(from, delta, pieces, ALL)
     }
 
-    /// Whether a part of a motion is free, cut into so many batches, beside what was near in the coarser look.
+    /// Whether a part of a motion, cut into `pieces` batches, is free of what was near in the coarser check.
     fn sweep_among(&mut self, from: &State, delta: &State, pieces: usize, among: Among) -> bool {
         if among.depth == LEVELS {
             return self.check(from, delta, pieces, among);
@@ -259,7 +258,7 @@ impl Space {
             let start: State = std::array::from_fn(|j| from[j] + piece[j] * i as f32);
             let edge = Edge { compiled: &self.compiled, start: &start, delta: &piece, batches: 1, among };
             let mut doubtful = self.isa.near(&edge, &mut self.scratch);
-            // Runs of steps, each cut finer as a motion of its own.
+            // Runs of doubtful steps, each divided as a motion of its own.
             while doubtful != 0 {
                 let first = doubtful.trailing_zeros();
                 let steps = (doubtful >> first).trailing_ones();
@@ -279,7 +278,7 @@ impl Space {
 
     fn batches(&self, delta: &State) -> usize {
         let length = length(&std::array::from_fn(|j| delta[j] * self.fineness[j]));
-        // In wholes of the widest batch, so that every machine looks at the same postures.
+        // In multiples of the widest batch, so that every machine checks the same postures.
         let widest = ((length * Space::RESOLUTION / WIDEST as f32).ceil() as usize).max(1);
         widest * (WIDEST / self.isa.width())
     }
@@ -322,13 +321,13 @@ pub fn between(a: &State, b: &State, fraction: f32) -> State {
     std::array::from_fn(|j| a[j] + (b[j] - a[j]) * fraction)
 }
 
-/// The posture at most so far from another on the straight way to a third, which is `far` from it.
+/// The posture on the straight way to another one, at most `at_most` from the start; `far` is the distance of the two.
 #[inline]
 pub(crate) fn towards(from: &State, to: &State, far: f32, at_most: f32) -> State {
     if far <= at_most { *to } else { between(from, to, at_most / far) }
 }
 
-/// How far a point is from an obstacle, in metres; zero inside.
+/// Distance of a point from an obstacle, in metres; zero inside.
 fn gap(obstacle: &Obstacle, point: [f64; 3]) -> f64 {
     let [x, y, z] = obstacle.pose.inverse().transform(point);
     let beyond = |p: f64, half: f64| (p.abs() - half).max(0.0);
@@ -358,7 +357,7 @@ fn compile_obstacle(obstacle: &Obstacle) -> simd::Obstacle {
     }
 }
 
-/// Adds clouds and meshes where they are reached; says whether a part that no joint moves stands in one.
+/// Adds clouds and meshes within reach; returns whether a link that no joint moves is in collision with one.
 fn add_clouds(
     compiled: &mut Compiled,
     mechanism: &Mechanism,
@@ -407,7 +406,7 @@ fn add_clouds(
     blocked
 }
 
-/// Small clouds of one radius that the same links may touch, and each other cloud by itself: every one of these gets a grid of its own.
+/// Groups of clouds with a grid each: small clouds of one radius that the same links may touch are joined, every other cloud is alone.
 fn joined<'c>(clouds: &'c [Cloud], mechanism: &Mechanism) -> Vec<Vec<&'c Cloud>> {
     let mut joined: BTreeMap<(u64, Vec<usize>), Vec<&Cloud>> = BTreeMap::new();
     let (small, large): (Vec<&Cloud>, Vec<&Cloud>) =
@@ -434,20 +433,20 @@ fn compile_row(order: &[usize], obstacles: &[Obstacle]) -> Row {
     row
 }
 
-/// Where a rigid part can be: within a sphere about the first joint of its chain.
+/// The reachable region of a rigid part: a sphere around the first joint of its chain.
 #[derive(Debug, Clone, Copy)]
 struct Shell {
     anchor: [f64; 3],
     reach: f64,
 }
 
-/// The robot's frames, rigid parts and groups, where each rigid part can be, and of each group its link. Groups whose links are allowed to touch
-/// other obstacles are not of one rigid part.
+/// The robot's frames, rigid parts and groups, the reachable region of each rigid part, and the link of each group. Groups whose links are allowed
+/// to touch other obstacles belong to different rigid parts.
 fn compile_robot(mechanism: &Mechanism, allowed: &[Vec<usize>], padding: f64) -> (Compiled, Vec<Shell>, Vec<usize>) {
     let mut frames: Vec<Frame> = Vec::new();
-    // Per frame: how far its origin can be from the first joint of its chain, and that joint's place.
+    // Per frame: the maximum distance of its origin from the first joint of its chain, and that joint's position.
     let mut chains: Vec<(f64, [f64; 3])> = vec![(0.0, [0.0; 3])];
-    // Per link: its frame, and where it is there.
+    // Per link: its frame, and its pose in the frame.
     let mut places: Vec<(usize, Pose)> = Vec::new();
     let mut compiled = Compiled { joints: mechanism.joints.len(), ..Compiled::default() };
     let mut links = Vec::new();
@@ -457,7 +456,7 @@ fn compile_robot(mechanism: &Mechanism, allowed: &[Vec<usize>], padding: f64) ->
         match link.drive {
             None => places.push((parent, origin)),
             Some(drive) => {
-                // The frame's z axis becomes the joint's axis.
+                // Rotates the frame so that its z axis is the joint's axis.
                 let aligned = align(drive.axis);
                 let moved = origin.compose(&aligned);
                 places.push((frames.len() + 1, aligned.inverse()));
@@ -490,7 +489,7 @@ fn compile_robot(mechanism: &Mechanism, allowed: &[Vec<usize>], padding: f64) ->
         }
     }
     compiled.frames = frames;
-    // The hand, deepest in the tree, is the likeliest to touch something.
+    // The hand, deepest in the tree, is most likely to collide.
     let mut order: Vec<usize> = (0..links.len()).collect();
     order.sort_by_key(|i| (Reverse(compiled.groups[*i].frame), &allowed[links[*i]], Reverse(*i)));
     compiled.groups = order.iter().map(|i| compiled.groups[*i].clone()).collect();
@@ -525,7 +524,7 @@ fn spheres(compiled: &Compiled) -> impl Iterator<Item = (usize, &[f32; 4])> {
     rigids.chain(compiled.groups.iter().map(|group| (group.frame, &group.coarse)))
 }
 
-/// Pairs, in the order of checking; `links` has the link of each group.
+/// The pairs of groups, in the order of checking; `links` has the link of each group.
 fn pairs(mechanism: &Mechanism, compiled: &Compiled, links: &[usize]) -> Vec<SelfPair> {
     let mut places = vec![(0, 0); mechanism.links.len()];
     for (r, rigid) in compiled.rigids.iter().enumerate() {
@@ -545,8 +544,8 @@ fn pairs(mechanism: &Mechanism, compiled: &Compiled, links: &[usize]) -> Vec<Sel
     sorted.collect()
 }
 
-/// The joint next towards the root, for each joint, by the first link that it moves. Links that follow it farther out do not count, so no
-/// joint is towards the root of itself.
+/// For each joint the next joint towards the root, by the first link that it moves. Mimic links farther out do not count, so no joint is its own
+/// parent.
 fn parents(compiled: &Compiled) -> Vec<Option<usize>> {
     let parent = |joint: usize| {
         let first = compiled.frames.iter().find(|frame| frame.joint == joint)?;
@@ -582,7 +581,7 @@ fn norm(sphere: &[f32; 4]) -> f32 {
     sphere[0].hypot(sphere[1]).hypot(sphere[2])
 }
 
-/// A rotation that takes z to the axis.
+/// A rotation that takes z to an axis.
 pub(crate) fn align(axis: [f64; 3]) -> Pose {
     let [x, y, z] = axis;
     if z < -1.0 + 1e-12 {
@@ -597,7 +596,7 @@ fn rows(pose: &Pose) -> [f32; 12] {
     std::array::from_fn(|i| if i < 9 { columns[i % 3][i / 3] } else { pose.position[i - 9] } as f32)
 }
 
-/// A small sphere that holds all of them (Bădoiu and Clarkson's steps towards the farthest).
+/// A small sphere that holds all spheres (by Bădoiu and Clarkson's steps towards the farthest one).
 fn enclose(spheres: &[[f32; 4]]) -> [f32; 4] {
     const STEPS: usize = 200;
     let reach = |c: &[f32; 3], s: &[f32; 4]| (0..3).map(|i| (c[i] - s[i]).powi(2)).sum::<f32>().sqrt() + s[3];

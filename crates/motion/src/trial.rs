@@ -1,4 +1,4 @@
-//! One planning problem solved as a user of the crate would, timed by the caller's clock and checked by the exact shapes.
+//! Solves one planning problem as a user of the crate would, with times from the caller's clock and a check by the exact shapes.
 
 use crate::confirmed::{Confirmed, Couples};
 use crate::connect::{Budget, ConnectError, Route, connect};
@@ -12,56 +12,56 @@ use crate::simplify::{path_length, simplify};
 use crate::space::{Isa, Space, State, state};
 use std::cell::RefCell;
 
-/// Postures per radian that the exact check looks at: four times those of the search.
+/// Postures per radian of the exact check: four times those of the search.
 const EXACT_PER_RADIAN: f64 = Space::EXACT_RESOLUTION as f64;
 
-/// How a problem is tried.
+/// Settings of a trial.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
-    /// What the search may cost.
+    /// The budget of the search.
     pub budget: Budget,
-    /// How often it is solved, for the least times; at least once. Every time gives the same path. What was not solved is not tried again.
+    /// Number of repetitions for the minimum times; at least one. Every repetition gives the same path. A failure is not repeated.
     pub repetitions: usize,
-    /// How long all of that may take before it is given up, in the clock's units; infinity for as long as the budget lasts.
+    /// Maximum time for everything, in the clock's units; infinity for as long as the budget lasts.
     pub limit: f64,
 }
 
-/// What came of a problem.
+/// The result of a trial.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Trial {
-    /// From the search to its path, in the clock's units.
+    /// Time of the search, in the clock's units.
     pub plan: f64,
-    /// From that to a short path that is free also between its postures.
+    /// Time of making the path short and free between its postures.
     pub simplify: f64,
-    /// Why there is none.
+    /// The path, or why there is none.
     pub outcome: Result<Found, ConnectError>,
-    /// What is wrong with the start or the goal, where that is why.
+    /// What is wrong with the start or the goal, if that is the reason.
     pub diagnosis: Vec<String>,
 }
 
-/// A path.
+/// A path that was found.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Found {
-    /// Postures, straight motions between them.
+    /// The postures, with straight motions between them.
     pub path: Vec<Vec<f64>>,
     /// Its length, in radians.
     pub length_rad: f32,
-    /// Before simplification.
+    /// Its length before simplification, in radians.
     pub first_length_rad: f32,
-    /// Samples drawn.
+    /// Number of samples drawn.
     pub iterations: usize,
-    /// Positions of the start and the goal that were beyond a limit by rounding and are at the limit on the path.
+    /// Positions of the start and the goal that exceeded a limit by rounding and are at the limit on the path.
     pub clamped: Vec<String>,
-    /// What the exact check rejects.
+    /// A contact that the exact check finds on the path.
     pub touch: Option<Touch>,
 }
 
-/// Solves a problem; `clock` gives the time in any units.
+/// Solves a problem; `clock` returns the time in any units.
 pub fn run(mechanism: &Mechanism, problem: &Problem, settings: Settings, clock: &mut dyn FnMut() -> f64) -> Trial {
     run_with_isa(mechanism, problem, settings, Isa::detect(), clock)
 }
 
-/// As [`run`], with instructions that are not the widest.
+/// As [`run`], with a given instruction set.
 pub fn run_with_isa(
     mechanism: &Mechanism,
     problem: &Problem,
@@ -93,7 +93,7 @@ pub fn run_with_isa(
     });
     let goals: Vec<Vec<f64>> = unwound.goals.iter().map(|goal| mechanism.clamped(goal).0).collect();
     let exact = Exact::new(mechanism, problem.surroundings());
-    // Some pairs are not looked at in the search: the exact shapes decide about its ends.
+    // The search skips some pairs, so the exact shapes decide about its ends.
     let goals: Vec<Vec<f64>> = goals.into_iter().filter(|goal| exact.touch(goal).is_none()).collect();
     let refusal = match () {
         () if exact.touch(&ends[0].0).is_some() => Some(ConnectError::Start),
@@ -116,7 +116,7 @@ pub fn run_with_isa(
         None => task.attempt(&mut task.confirming(&doubts), begin, &now),
     };
     let mut lines = Vec::new();
-    // Spheres may leave no way where the shapes do, and the shapes reject what was found beside pairs that the search does not look at.
+    // Spheres may block a way that the shapes leave free, and the shapes may reject a path because of pairs that the search skips.
     let again = match &tried.outcome {
         Ok(Found { touch: Some(_), .. }) => {
             doubts.extend(Couples { pairs: mechanism.by_shapes.clone(), ..Couples::default() })
@@ -131,7 +131,7 @@ pub fn run_with_isa(
     if again && now() - begin < settings.limit {
         task.settings.repetitions = 1;
         let mended = task.attempt(&mut task.confirming(&doubts), begin, &now);
-        // A path that the shapes reject is still told as one where there is no other.
+        // A path that the shapes reject is still returned if there is no other.
         if mended.outcome.is_ok() || tried.outcome.is_err() {
             tried = Tried { plan: tried.plan + tried.simplify + mended.plan, ..mended };
         }
@@ -148,7 +148,7 @@ pub fn run_with_isa(
     Trial { plan, simplify, outcome, diagnosis }
 }
 
-/// What is searched.
+/// What is searched, and how.
 struct Task<'t> {
     unwound: &'t Unwound,
     problem: &'t Problem,
@@ -158,7 +158,7 @@ struct Task<'t> {
     goals: &'t [Vec<f64>],
 }
 
-/// What came of a search, and how long it took.
+/// The result of a search, with its time.
 struct Tried {
     plan: f64,
     simplify: f64,
@@ -166,7 +166,7 @@ struct Tried {
 }
 
 impl Task<'_> {
-    /// The robot among the obstacles, of which this is looked at by exact shapes.
+    /// The space with these couples checked by exact shapes.
     fn confirming(&self, doubts: &Couples) -> Space {
         let (mechanism, surroundings) = (&self.unwound.mechanism, self.problem.surroundings());
         let mut space = Space::with_isa(&doubts.left_out_of(mechanism), surroundings, self.isa);
@@ -174,7 +174,7 @@ impl Task<'_> {
         space
     }
 
-    /// Searches, as often as the settings want it and something is found, until the limit of time after `begin`.
+    /// Searches as often as the settings ask for, while a path is found, until the time limit after `begin`.
     fn attempt(&self, space: &mut Space, begin: f64, now: &dyn Fn() -> f64) -> Tried {
         let Task { problem, settings, .. } = self;
         let start = state(self.start);
@@ -183,7 +183,7 @@ impl Task<'_> {
         let (mut plan, mut simplified) = (f64::INFINITY, f64::INFINITY);
         let mut routes = Err(ConnectError::Cancelled);
         for repetition in 0..settings.repetitions.max(1) {
-            // Every time gives the same path, or the same failure.
+            // Every repetition gives the same path, or the same failure.
             let is_enough = now() - begin > settings.limit || routes.is_err();
             if repetition > 0 && is_enough {
                 break;
@@ -198,13 +198,13 @@ impl Task<'_> {
             let end = now();
             plan = plan.min(between - begin);
             simplified = simplified.min(end - between);
-            // One that was stopped by the time is none.
+            // A repetition that was stopped by the time limit does not count.
             if repetition == 0 || paths.is_ok() {
                 routes = paths;
             }
         }
         let outcome = routes.map_err(|error| match error {
-            // The same one, turned to by other ways.
+            // These are the one original goal, reached by other turns.
             ConnectError::Goal { .. } => ConnectError::Goal { goals: 1 },
             error => error,
         });

@@ -1,4 +1,4 @@
-//! Whether the arm may follow a trajectory: what a controller checks before it moves, against what it knows itself.
+//! Validates a trajectory of the arm: what a controller checks before it moves, with what it knows itself.
 
 use crate::collision::{Checker, Collision, Contact};
 use crate::cubic::Cubic;
@@ -10,58 +10,58 @@ use crate::trajectory::{Curve, Knot, TrajectoryError};
 use ratn_model::value::Trajectory;
 use ratn_world::scene::Scene;
 
-/// How far from the arm's position a trajectory may start, per joint, in radians (metres for one that slides).
+/// Maximum distance of a trajectory's start from the arm's position, per joint, in radians (metres for a prismatic joint).
 pub const START_TOLERANCE_RAD: f64 = 0.01;
 
-/// How much a limit may be exceeded, as a fraction: rounding.
+/// By how much a limit may be exceeded, as a fraction: rounding.
 const LIMIT_TOLERANCE: f64 = 0.01;
 
-/// How far a position may be beyond its limit, in radians or metres.
+/// By how much a position may exceed its limit, in radians or metres.
 const POSITION_TOLERANCE: f64 = 1e-3;
 
-/// What is touched by less than this may go unseen, in metres.
+/// A contact less deep than this may be missed, in metres.
 pub(crate) const RESOLUTION_M: f64 = 5e-4;
 
 /// Why a trajectory may not be followed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Violation {
-    /// It is not a trajectory of this arm.
+    /// It is no trajectory of this arm.
     #[error(transparent)]
     Malformed(#[from] TrajectoryError),
-    /// It starts elsewhere.
+    /// It does not start at the arm's position.
     #[error("{joint} is at {actual:.4} {unit}, the trajectory starts at {start:.4} {unit}")]
     Start {
-        /// Which joint.
+        /// The joint.
         joint: String,
-        /// Where it is.
+        /// Its position.
         actual: f64,
         /// Where the trajectory starts.
         start: f64,
-        /// What positions of the joint are given in.
+        /// The unit of its position.
         unit: &'static str,
     },
     /// It does not start or end at rest.
     #[error("{joint} moves at {velocity:.4} per second at {time_s:.3} s, where the trajectory must be at rest")]
     NotAtRest {
-        /// Which joint.
+        /// The joint.
         joint: String,
-        /// How fast.
+        /// Its velocity, per second.
         velocity: f64,
-        /// When.
+        /// The time.
         time_s: f64,
     },
-    /// A position, velocity, acceleration or jerk beyond the limit.
+    /// A position, velocity, acceleration or jerk exceeds its limit.
     #[error("{joint} reaches {what} {value:.3} at {time_s:.3} s, its limit is {limit:.3}")]
     Limit {
-        /// Which joint.
+        /// The joint.
         joint: String,
         /// Position, velocity, acceleration or jerk.
         what: &'static str,
-        /// How much.
+        /// Its value.
         value: f64,
-        /// What is allowed.
+        /// The limit.
         limit: f64,
-        /// When.
+        /// The time.
         time_s: f64,
     },
     /// The acceleration steps, so the jerk has no bound.
@@ -69,25 +69,26 @@ pub enum Violation {
         "the acceleration of {joint} steps by {step:.3} at {time_s:.3} s: its jerk is limited, so it must be continuous"
     )]
     Step {
-        /// Which joint.
+        /// The joint.
         joint: String,
-        /// By how much.
+        /// The size of the step.
         step: f64,
-        /// When.
+        /// The time.
         time_s: f64,
     },
-    /// Something is in the way.
+    /// A collision.
     #[error("at {time_s:.2} s {collision}")]
     Collision {
-        /// When.
+        /// The time.
         time_s: f64,
         /// What touches what.
         collision: Collision,
     },
 }
 
-/// Checks a trajectory for the arm of a robot that is as in `here`, its base where the scene has it, with the `contact` that the motion may
-/// make. Returns it ready to be sampled, from where the arm is: a joint that turns without end may be whole turns from where the trajectory begins.
+/// Checks a trajectory of the arm, with the rest of the robot as in `here`, its base where the scene has it, and the `contact` that the motion may
+/// make. Returns the curve ready for sampling, beginning at the arm's position: a continuous joint may be whole turns from where the trajectory
+/// begins.
 ///
 /// # Errors
 /// The first [`Violation`].
@@ -119,7 +120,7 @@ fn check_start(robot: &Robot, start: &JointVector, trajectory: &Curve) -> Result
     Ok(())
 }
 
-/// It starts and ends at rest.
+/// Checks that it starts and ends at rest.
 pub(crate) fn check_rest(joints: &[Joint], trajectory: &Curve) -> Result<(), Violation> {
     let knots = trajectory.knots();
     let moves = |knot: &Knot| (0..joints.len()).find(|j| knot.velocities[*j].abs() > 1e-3);
@@ -132,8 +133,8 @@ pub(crate) fn check_rest(joints: &[Joint], trajectory: &Curve) -> Result<(), Vio
     }
 }
 
-/// Positions, velocities, accelerations and jerks are within the limits, between the knots too: the extremes of the cubics, in closed
-/// form. Where the acceleration steps from one cubic to the next, or from rest, the jerk has no bound.
+/// Checks that positions, velocities, accelerations and jerks are within the limits, also between the knots: the extremes of the cubics, in closed
+/// form. If the acceleration steps from one cubic to the next, or from rest, the jerk has no bound.
 pub(crate) fn check_limits(joints: &[Joint], trajectory: &Curve) -> Result<(), Violation> {
     let knots = trajectory.knots();
     let exceeded = |j: usize, what, value: f64, limit: f64, time_s| {
@@ -175,8 +176,8 @@ pub(crate) fn check_limits(joints: &[Joint], trajectory: &Curve) -> Result<(), V
     Ok(())
 }
 
-/// Checks all of a motion, at whose start the gripper may be in something: that is left first, as a retreat does ([`Leaving`]). `goes_on` is asked
-/// before each look of the rest; returns whether all of it was looked at.
+/// Checks a whole motion. If the gripper is inside an object at its start, that contact is left first, as in a retreat ([`Leaving`]). `goes_on` is
+/// called before each check of the rest; returns whether all of it was checked.
 pub(crate) fn check_collisions_while(
     checker: &mut Checker<'_>,
     trajectory: &Curve,
@@ -195,7 +196,7 @@ pub(crate) fn check_collisions_while(
         && check_part(checker, trajectory, [left_s, whole[1]], contact, goes_on)?)
 }
 
-/// When everything that was touched at the start has been left.
+/// The time when all contacts of the start have been left.
 fn left_after_s(mut leaving: Leaving, checker: &mut Checker<'_>, trajectory: &Curve) -> Result<f64, Violation> {
     for (i, pair) in trajectory.knots().windows(2).enumerate() {
         let lasts_s = pair[1].time_s - pair[0].time_s;
@@ -214,8 +215,8 @@ fn left_after_s(mut leaving: Leaving, checker: &mut Checker<'_>, trajectory: &Cu
     Err(Violation::Collision { time_s: trajectory.duration_s(), collision: leaving.told() })
 }
 
-/// Looks at the middle of a piece of the curve: where there is more room than anything moves from there within the piece, the piece is
-/// free; else its halves are looked at, until they are so short that nothing moves by more than [`RESOLUTION_M`].
+/// Checks the middle of a piece of the curve. If the distance there is more than anything moves from there within the piece, the piece is free;
+/// otherwise its halves are checked, until they are so short that nothing moves by more than [`RESOLUTION_M`].
 fn check_part(
     checker: &mut Checker<'_>,
     trajectory: &Curve,
@@ -229,7 +230,7 @@ fn check_part(
     for (i, pair) in knots.windows(2).enumerate() {
         let cubics = trajectory.cubics(i);
         let within = [begins_s.max(pair[0].time_s), ends_s.min(pair[1].time_s)].map(|time_s| time_s - pair[0].time_s);
-        // In order of time: the last is taken first.
+        // In the order of time: the last piece is checked first.
         let mut pieces = if within[0] < within[1] { vec![within] } else { Vec::new() };
         while let Some([from, to]) = pieces.pop() {
             if !goes_on() {

@@ -1,12 +1,12 @@
-//! Whether the links of two parts of the robot (arms, its head) keep a distance from each other, wherever both are on their ways.
+//! Whether the links of two parts of the robot (arms, its head) keep a minimum distance wherever both are along their motions.
 //!
-//! Either part may be stopped anywhere on its way: its goal is cancelled, its lease ends, a fault brakes it. So the ways are compared whatever
-//! the timing: every place of the one with every place of the other. Controllers know the robot's links, not what stands around them; so what
-//! the hands hold is not looked at here, the judge sees that (`contacts`).
+//! Either part may be stopped anywhere along its motion: its goal is cancelled, its lease ends, or a fault brakes it. So the motions are compared
+//! independently of timing: every position of one part with every position of the other. Controllers know the robot's links, not the obstacles
+//! around them; so held objects are not compared here, the judge checks them (`contacts`).
 //!
-//! The comparison runs on the cell's only thread, where an emergency stop waits for its end. So its work is bounded. Of two ways, places that one
-//! comes to again are kept once, and the places of a body form a binary tree of which whole branches are ruled out by one distance. Beside a
-//! part that stands, postures are passed over as long as no joint has moved anything by as much as there was room (conservative advancement,
+//! The comparison runs on the cell's only thread, and an emergency stop has to wait for it, so its work is bounded. Positions that a motion visits
+//! again are kept once, and the positions of a body form a binary tree whose branches are ruled out by one distance each. Beside a standing part,
+//! postures are skipped as long as no joint has moved anything by as much as there was room at the last comparison (conservative advancement,
 //! Mirtich 1996). A comparison that takes more than [`MAX_POSTURES`], [`MAX_DISTANCES`] or [`MAX_SEARCHES`] is given up ([`Crossing::TooLong`]).
 
 use super::levers::Levers;
@@ -17,25 +17,25 @@ use ratn_motion::distance::gap_within;
 use ratn_motion::robot::{ArmPosition, Configuration, Joint, Robot, to_f32};
 use std::collections::BTreeMap;
 
-/// The distance of two parts that are both on their ways, in metres.
+/// Minimum distance of two moving parts, in metres.
 pub(super) const APART_M: f64 = 0.02;
-/// The distance of a part on its way from one that stands, in metres: more than controllers and encoders are off.
+/// Minimum distance of a moving part from a standing one, in metres: more than the errors of controllers and encoders.
 pub(super) const BESIDE_M: f64 = 0.003;
-/// How much nearer than at its start something may come to a part that it is too near to already, in metres: rounding.
+/// How much nearer than at its start a body may come to a part that is already too near, in metres: rounding.
 const ROUNDED_M: f32 = 3e-4;
-/// The most postures of two parts on their ways that are compared. A motion of 10 s has 2500, for each place of the fingers. Ways that are longer
-/// are thinned before (`levers`), so that this is a bound of how far a part goes and not of how long it takes.
+/// Maximum number of postures of two moving parts that are compared. A motion of 10 s has 2500 for each finger position. Longer motions are
+/// thinned before (`levers`), so that this limits how far a part moves and not how long it takes.
 pub(super) const MAX_POSTURES: usize = 40_000;
-/// The most distances of two bodies that are computed for one comparison.
+/// Maximum number of distances of two bodies computed for one comparison.
 const MAX_DISTANCES: u32 = 200_000;
-/// The most searches of these: where a body is a mesh, each of its triangles that is near the other body takes one, which is some microsecond.
+/// Maximum number of searches for these distances: each triangle of a mesh that is near the other body takes one, about a microsecond.
 const MAX_SEARCHES: u32 = 1_000_000;
-/// Of places on two ways that are nearer to each other than that one is kept, in metres: it is added to the distance on either side.
+/// Of positions on two motions that are nearer to each other than this only one is kept, in metres; this is added to the distance on either side.
 const RESOLUTION_M: f32 = 0.008;
-/// The same of a part that stands; of an arm the fingers alone may move.
+/// The same beside a standing part. Of a standing arm only the fingers may move.
 const FINE_M: f32 = 1e-4;
 
-/// A part of the robot that moves beside others.
+/// A part of the robot that moves beside other parts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Part {
     /// The arm of this number, with its fingers.
@@ -44,87 +44,87 @@ pub(super) enum Part {
     Head,
 }
 
-/// What of its bounds a comparison has left.
+/// The remaining work that a comparison may do.
 #[derive(Debug, Clone)]
 struct Work {
     distances: u32,
     searches: u32,
 }
 
-/// What a part, or the fingers of an arm alone, will do.
+/// The future motion of a part, or of the fingers of an arm alone.
 #[derive(Debug, Clone)]
 pub(super) struct Ahead {
     pub(super) part: Part,
     /// The links that are compared: all that move.
     pub(super) links: Vec<usize>,
-    /// Courses that it may take: of each the positions, near each other, in the order of time.
+    /// Possible courses of the part: for each the positions in the order of time, with small steps.
     pub(super) courses: Vec<Vec<ArmPosition>>,
-    /// How far anything may be beside the nearest position, in metres: positions stand for those that are left out.
+    /// Maximum distance of any point from its place at the nearest position, in metres, because positions stand for those that are left out.
     pub(super) beside_m: f64,
-    /// How far fingers may be beside the nearest course besides, in metres: courses stand for what is between them.
+    /// Additional distance of the fingers from the nearest course, in metres, because courses stand for the finger positions between them.
     pub(super) between_m: f64,
 }
 
-/// What the other part does meanwhile, which says how far apart both have to be.
+/// What the other part does meanwhile; it decides the minimum distance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Other {
-    /// It is on its way: [`APART_M`].
+    /// It moves: [`APART_M`].
     Moves,
-    /// It stands: [`BESIDE_M`]. What is nearer than that already may go away, and come no nearer.
+    /// It stands: [`BESIDE_M`]. What is nearer than that already may move away, but come no nearer.
     Stands,
 }
 
-/// Why two ways are not free.
+/// Why two motions do not keep their distance.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Crossing {
-    /// A link of each comes too close to the other.
+    /// A link of one part comes too close to a link of the other.
     TooClose {
-        /// Of the part that is asked about.
+        /// The link of the part that asks.
         link: String,
-        /// Of the other one.
+        /// The link of the other part.
         other: String,
     },
-    /// They are too long, or too near to each other for too long, to be compared.
+    /// The motions are too long, or too near to each other for too long, to be compared.
     TooLong,
 }
 
-/// One body of a link, wherever it is on the way.
+/// One body of a link, with all its positions along the motion.
 struct Swept {
     link: usize,
     in_link: Pose,
     shape: SharedShape,
-    /// The farthest that a point of it is from its origin.
+    /// Maximum distance of its points from its origin.
     radius: f32,
     places: Vec<Pose32>,
-    /// The places as the leaves of a binary tree, its root last.
+    /// The positions as the leaves of a binary tree, whose root is last.
     tree: Vec<Branch>,
-    /// The farthest that a point moves from one posture to the next.
+    /// Maximum motion of a point between two consecutive postures.
     leg: f32,
-    /// The farthest that a point is from where it is at the place that was kept instead.
+    /// Maximum distance of a point from its place at the position that was kept instead.
     dropped: f32,
 }
 
-/// Some of the places of a body that follow each other.
+/// Consecutive positions of a body.
 struct Branch {
-    /// One of them.
+    /// Index of one of them.
     place: usize,
-    /// The farthest that a point of the body is at any of them from where it is at that one.
+    /// Maximum distance of a point of the body at any of them from its place at that one.
     spread: f32,
     halves: Option<[usize; 2]>,
 }
 
-/// Which places of a body are kept.
+/// The positions of a body that are kept.
 struct Kept {
     /// By their rounded coordinates.
     known: BTreeMap<[i32; 7], Pose32>,
-    /// The one that stands for the last posture.
+    /// The kept position that stands for the last posture.
     last: Option<Pose32>,
-    /// The place at the posture before.
+    /// The position at the posture before.
     before: Option<Pose32>,
 }
 
 impl Other {
-    /// How far from the other part to stay, in metres.
+    /// Minimum distance from the other part, in metres.
     pub(super) fn apart_m(self) -> f64 {
         match self {
             Other::Moves => APART_M,
@@ -133,10 +133,10 @@ impl Other {
     }
 }
 
-/// Whether what moves stays away from another part, of a robot that is elsewhere as in `here`.
+/// Whether a moving part stays away from another part; the rest of the robot is as in `here`.
 ///
 /// # Errors
-/// [`Crossing`] where it does not, or where that is not found out.
+/// [`Crossing`] if it does not, or if that cannot be decided.
 pub(super) fn keep_apart(
     robot: &Robot,
     here: &Configuration,
@@ -150,7 +150,7 @@ pub(super) fn keep_apart(
     }
 }
 
-/// Whether two ways keep [`APART_M`] from each other.
+/// Whether two motions keep [`APART_M`] from each other.
 fn ways_apart(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahead) -> Result<(), Crossing> {
     if ours.postures() + theirs.postures() > MAX_POSTURES {
         return Err(Crossing::TooLong);
@@ -168,15 +168,15 @@ fn ways_apart(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahead)
     Ok(())
 }
 
-/// Whether a way keeps [`BESIDE_M`] from a part that stands. A body that is nearer as it sets out may come no nearer, and a finger of which only
-/// some courses are compared has to be as far away as they are from each other.
+/// Whether a motion keeps [`BESIDE_M`] from a standing part. A body that is nearer at the start may come no nearer, and a finger of which only
+/// some courses are compared has to be farther away by the distance between them.
 fn stays_beside(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahead) -> Result<(), Crossing> {
     let (bodies, others) = (Swept::all(robot, ours), swept(robot, here, theirs, FINE_M));
     let levers = ours.levers(robot);
     let between = ours.between_courses(robot);
     let (mut work, mut configuration) = (Work::WHOLE, *here);
     for course in &ours.courses {
-        // How near each pair may come, once it is known how near it is at the start; and whether that is nearer than it should be.
+        // Per pair: how near it may come, once its distance at the start is known; and whether that is nearer than it should be.
         let mut allowed: Vec<Option<(f32, bool)>> = vec![None; bodies.len() * others.len()];
         let mut looked_at: Option<(&ArmPosition, f32)> = None;
         for (i, at) in course.iter().enumerate() {
@@ -200,7 +200,7 @@ fn stays_beside(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahea
                     let up_to = known.map_or(f32::INFINITY, |(least, _)| (room.max(leg) + least).max(sure + leg));
                     let distance = a.nearest(&place, b, up_to, &mut work)?;
                     let (least, is_near) = match *known {
-                        // Once it has been far enough away it comes back as any other.
+                        // Once it has been far enough away, the usual minimum applies when it comes back.
                         _ if distance >= sure + leg => (sure, false),
                         Some(known) => known,
                         None => (distance.min(BESIDE_M as f32) - ROUNDED_M, true),
@@ -218,7 +218,7 @@ fn stays_beside(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahea
     Ok(())
 }
 
-/// The bodies of a part's links wherever they come to.
+/// The bodies of a part's links with all their positions.
 fn swept(robot: &Robot, here: &Configuration, ahead: &Ahead, resolution: f32) -> Vec<Swept> {
     let mut swept: Vec<(Swept, Kept)> =
         Swept::all(robot, ahead).into_iter().map(|body| (body, Kept::nothing())).collect();
@@ -246,7 +246,7 @@ fn swept(robot: &Robot, here: &Configuration, ahead: &Ahead, resolution: f32) ->
 }
 
 impl Part {
-    /// Brings the part to a position.
+    /// Puts the part at a position.
     fn put(self, at: &ArmPosition, configuration: &mut Configuration) {
         match self {
             Part::Arm(arm) => {
@@ -281,7 +281,7 @@ impl Ahead {
         Levers::of(robot, self.part, &self.links)
     }
 
-    /// How far a point of a link may be beside the nearest course: only fingers are elsewhere from one to the next.
+    /// Maximum distance of a point of a link from the nearest course: only fingers differ from one course to the next.
     fn between_courses(&self, robot: &Robot) -> impl Fn(usize) -> f32 {
         let (fingers, between_m) = (self.part.finger_links(robot), self.between_m as f32);
         move |link| if fingers.contains(&link) { between_m } else { 0.0 }
@@ -306,7 +306,7 @@ impl Crossing {
 }
 
 impl Swept {
-    /// The bodies of the links that are compared, nowhere yet.
+    /// The bodies of the links that are compared, still without positions.
     fn all(robot: &Robot, ahead: &Ahead) -> Vec<Swept> {
         let of_link = |link: &usize| {
             let (link, of) = (*link, &robot.model.links[*link]);
@@ -323,15 +323,15 @@ impl Swept {
         Swept { link, in_link, shape, radius, places: Vec::new(), tree: Vec::new(), leg: 0.0, dropped: 0.0 }
     }
 
-    /// The farthest that a point of the body is at one place from where it is at another.
+    /// Upper bound of the distance of a point of the body at one position from its place at another.
     fn moved(&self, from: &Pose32, to: &Pose32) -> f32 {
         let [x, y, z, _] = (from.rotation.inverse() * to.rotation).to_array();
-        // The sine of half the angle: a point turns by a chord of twice that.
+        // The sine of half the angle; a point moves along a chord of twice that.
         let sine = (x * x + y * y + z * z).sqrt();
         (to.translation - from.translation).length() + 2.0 * self.radius * sine
     }
 
-    /// The body comes to a place.
+    /// Adds a position of the body.
     fn pass(&mut self, place: Pose32, kept: &mut Kept, resolution: f32) {
         if let Some(before) = kept.before.replace(place) {
             self.leg = self.leg.max(self.moved(&before, &place));
@@ -348,8 +348,8 @@ impl Swept {
         self.dropped = self.dropped.max(dropped);
     }
 
-    /// Coordinates that two places have in common only where no point of the body is farther apart than the resolution: half of it is for
-    /// the translation and half for the rotation.
+    /// Coordinates that two positions share only if no point of the body is farther apart than the resolution: half of it is for the translation
+    /// and half for the rotation.
     fn rounded(&self, place: &Pose32, resolution: f32) -> [i32; 7] {
         let along = resolution / (2.0 * 3_f32.sqrt());
         let about = resolution / (8.0 * self.radius.max(1e-3));
@@ -360,12 +360,12 @@ impl Swept {
         [x, y, z, i, j, k, w]
     }
 
-    /// How far a point of the body may be, anywhere on the way, from where it is at the nearest place that was kept.
+    /// Maximum distance of a point of the body, anywhere along the motion, from its place at the nearest kept position.
     fn missed(&self) -> f32 {
         self.dropped + self.leg / 2.0
     }
 
-    /// Makes a branch of the places `from..to`.
+    /// Makes the branch of the positions `from..to`.
     fn grow(&mut self, from: usize, to: usize) -> usize {
         let place = usize::midpoint(from, to);
         let spread = self.places[from..to].iter().map(|at| self.moved(&self.places[place], at)).fold(0.0_f32, f32::max);
@@ -374,7 +374,7 @@ impl Swept {
         self.tree.len() - 1
     }
 
-    /// How far it is at a place from another body at one, or something greater than `enough` where that is more.
+    /// Distance from another body, each at one position, or any value greater than `enough` if it is more than that.
     fn distance(&self, at: &Pose32, other: &Swept, of: &Pose32, enough: f32, work: &mut Work) -> Result<f32, Crossing> {
         work.distances = work.distances.checked_sub(1).ok_or(Crossing::TooLong)?;
         let shapes = [&*self.shape, &*other.shape];
@@ -386,12 +386,12 @@ impl Swept {
         }
     }
 
-    /// Whether two bodies are to be kept apart: not where their links are excepted.
+    /// Whether two bodies are to be kept apart: not if their links are excepted.
     fn is_kept_from(&self, other: &Swept, robot: &Robot) -> bool {
         !robot.model.is_excepted(self.link, other.link)
     }
 
-    /// How far it is from another body at the places of that one, or `up_to` where that is less.
+    /// Minimum distance from another body at all positions of that body, at most `up_to`.
     fn nearest(&self, at: &Pose32, other: &Swept, up_to: f32, work: &mut Work) -> Result<f32, Crossing> {
         let mut nearest = up_to;
         for of in &other.places {
@@ -402,7 +402,7 @@ impl Swept {
         Ok(nearest)
     }
 
-    /// Whether any of its places is nearer than `margin` to any place of another body.
+    /// Whether any of its positions is nearer than `margin` to any position of another body.
     fn comes_to(&self, other: &Swept, margin: f32, work: &mut Work) -> Result<bool, Crossing> {
         let (Some(ours), Some(theirs)) = (self.tree.len().checked_sub(1), other.tree.len().checked_sub(1)) else {
             return Ok(false);
@@ -440,7 +440,7 @@ mod tests {
         Configuration { arm: robot.posture("home").unwrap(), ..robot.at_zero() }
     }
 
-    /// The arm swings about its foot by so much and back, so many times; each way takes so many steps.
+    /// An arm that swings about its foot by `by` and back, `times` times, in `steps` steps each way.
     fn swings(robot: &Robot, by: f64, steps: u32, times: u32) -> Ahead {
         let from = robot.posture("home").unwrap();
         let at = |i: u32| {

@@ -1,27 +1,27 @@
-//! What of the gripper is in an object in a posture, how deep, and which way is the shortest out of it.
+//! Contacts of the gripper: what of it is inside an object in a posture, how deep, and the shortest way out.
 //!
-//! An arm that stands in contact has to be able to leave it (`leaving`). This file says what is touched there; it does not decide what may
-//! be. Hand, fingers and what they hold count, against the objects of a scene: never the other links of the arm, the robot itself, a box to keep out of,
-//! or a cloud.
+//! An arm that stands in contact has to be able to leave it (`leaving`). This file finds the contacts; it does not decide which are allowed. Only
+//! contacts of the hand, the fingers and what they hold with objects of the scene count: never the other links of the arm, the robot itself, a box
+//! to keep out of, or a cloud.
 
 use super::{Checker, Collision, Entry, Other, Role};
 use crate::distance;
 use crate::joint_vector::JointVector;
 
-/// A part of the gripper in an object.
+/// A part of the gripper that is inside an object.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Touch {
-    /// By their numbers in the checker.
+    /// Indices in the checker.
     moving: usize,
     obstacle: usize,
     /// Whether the held object touches, not the gripper itself.
     pub(crate) is_held: bool,
-    /// How deep it is in it, in metres, without any padding.
+    /// Penetration in metres, without any padding.
     pub(crate) depth_m: f64,
 }
 
 impl<'a> Checker<'a> {
-    /// Everything of the gripper that is in an object in a posture.
+    /// All parts of the gripper that are inside an object in a posture.
     pub(crate) fn touches(&mut self, arm: &JointVector) -> Vec<Touch> {
         self.place(arm);
         let mut touches = Vec::new();
@@ -38,13 +38,13 @@ impl<'a> Checker<'a> {
         touches
     }
 
-    /// How deep the two of a touch are in each other in a posture, in metres; 0 where they are apart.
+    /// Penetration of each touch in a posture, in metres; 0 without contact.
     pub(crate) fn depths_m(&mut self, touches: &[Touch], arm: &JointVector) -> Vec<f64> {
         self.place(arm);
         touches.iter().map(|touch| self.depth_in(touch.moving, touch.obstacle)).collect()
     }
 
-    /// The same checker, which does not look at these touches.
+    /// The same checker without the pairs of these touches.
     pub(crate) fn without(&self, touches: &[Touch]) -> Checker<'a> {
         let mut checker = self.clone();
         for touch in touches {
@@ -53,26 +53,26 @@ impl<'a> Checker<'a> {
         checker
     }
 
-    /// Where the gripper has to go to leave a touch on the shortest way, in the world frame, in the posture checked last; its length is 1.
+    /// Direction of the shortest way out of a touch, a unit vector in the world frame, for the posture checked last.
     pub(crate) fn way_out(&self, touch: &Touch) -> Option<[f64; 3]> {
         let (moving, obstacle) = (&self.moving[touch.moving], &self.obstacles[touch.obstacle]);
         let (own, other) = (&self.placed[touch.moving], &obstacle.pose);
         distance::way_out(own, &*moving.solid.shape, other, &*obstacle.solid.shape)
     }
 
-    /// What messages say of a touch that is so deep.
+    /// The touch, at this depth, as it is reported in messages.
     pub(crate) fn told(&self, touch: &Touch, depth_m: f64) -> Collision {
         let (moving, other) = (&self.moving[touch.moving].name, &self.obstacles[touch.obstacle].name);
         let (moving, other) = (moving.clone(), other.clone());
         Collision { moving, other, depth_m, padding_m: 0.0 }
     }
 
-    /// Something that stands in the scene and may be touched.
+    /// Whether an obstacle is an object of the scene that may be touched.
     fn is_object(&self, o: usize) -> bool {
         self.obstacles[o].link.is_none() && self.obstacles[o].entry != Entry::Never
     }
 
-    /// In the posture checked last.
+    /// Penetration in the posture checked last.
     fn depth_in(&self, i: usize, o: usize) -> f64 {
         let reach = self.moving[i].radius + self.obstacles[o].radius;
         if self.centres[i].distance_squared(self.obstacles[o].centre) >= reach * reach {

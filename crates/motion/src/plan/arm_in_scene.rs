@@ -1,7 +1,7 @@
-//! The arm in the scene of one request: what is free, what the tool keeps, how the tool goes straight, and how long a motion takes.
+//! The arm in the scene of one request: collision checks, constraints on the tool, straight motions of the tool, and durations.
 //!
-//! Two checks know the scene. The exact shapes ([`Checker`]) decide about straight parts, where contact may be allowed, and about starts and
-//! goals. The vector checks ([`Space`]) decide about free motions; a posture where they have room is a *door* from one to the other.
+//! There are two collision checks. The exact shapes ([`Checker`]) decide about straight parts, where contact may be allowed, and about starts and
+//! goals. The vector checks ([`Space`]) decide about free motions; a posture where they find room is a *door* from one to the other.
 
 use super::contact;
 use super::error::PlanError;
@@ -42,20 +42,20 @@ const TIGHT_PADDING_M: f64 = 0.002;
 /// The paddings that a start may have, in the order in which they are tried.
 pub(super) const PADDINGS_M: [f64; 3] = [PADDING_M, TIGHT_PADDING_M, 0.0];
 
-/// Postures tried around one that has no room, and how far away the last of them are, in radians per joint.
+/// Number of random postures tried around a posture without room, and the distance of the last of them, in radians per joint.
 const WAYS_OUT: usize = 100;
 const WAY_OUT_RAD: f64 = 0.4;
 
-/// How far a retreat goes.
+/// Where a retreat ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Extent {
-    /// All of the straight part.
+    /// At the end of the straight part.
     Whole,
-    /// To the first posture that is free.
+    /// At the first free posture.
     UntilFree,
 }
 
-/// The exact shapes of a request in a scene.
+/// The checker of the exact shapes for a request.
 fn checker<'a>(
     robot: &'a Robot,
     scene: &Scene,
@@ -78,14 +78,14 @@ pub(super) struct ArmInScene<'a> {
     here: Configuration,
     checker: Checker<'a>,
     search: Search<'a>,
-    /// The pairs of links that spheres say nothing of, and what links with meshes are beside of which they do not, by the exact shapes.
+    /// The couples that the vector checks leave out, checked by exact shapes: pairs of links, and links with obstacles.
     unseen: [Option<Checker<'a>>; 2],
-    /// What a camera saw that is nothing known, in the world frame.
+    /// Points that a camera saw and that belong to no known object, in the world frame.
     seen: Option<Arc<Cloud>>,
-    /// The tool, in the frame of the base, which is at `base`.
+    /// The kinematics of the tool in the frame of the base, which is at `base`.
     reach: Reach,
     base: Pose,
-    /// What the tool keeps.
+    /// The constraint on the tool.
     constraint: Option<Constraint>,
     rough: Rough,
     random: ChaCha8Rng,
@@ -145,54 +145,54 @@ impl<'a> ArmInScene<'a> {
         joints(self.robot, state)
     }
 
-    /// The tool in the world frame.
+    /// The tool's pose in the world frame.
     pub(super) fn tool_pose(&self, arm: &JointVector) -> Pose {
         self.robot.tool_pose(&Configuration { arm: *arm, ..self.here })
     }
 
-    /// The tool in the frame of the base.
+    /// The tool's pose in the frame of the base.
     pub(super) fn tool_from_base(&self, arm: &JointVector) -> Pose {
         self.reach.pose(arm)
     }
 
-    /// Has the exact shapes checked with another padding from now on.
+    /// Sets the padding of the exact shapes.
     pub(super) fn pad(&mut self, padding_m: f64) {
         if self.checker.padding() != padding_m {
             self.checker = checker(self.robot, self.scene, self.request, &self.here, self.seen.as_ref(), padding_m);
         }
     }
 
-    /// Has them checked with room: an arm may stand closer to something, where it was stopped, but it does not go there.
+    /// Sets the padding to at least the tight one: an arm may stand closer to something where it was stopped, but it must not move there.
     pub(super) fn pad_at_least_tightly(&mut self) {
         if self.checker.padding() < TIGHT_PADDING_M {
             self.pad(TIGHT_PADDING_M);
         }
     }
 
-    /// The exact shapes as the tool leaves a goal where it lets go of what it holds; `None` where it holds nothing.
+    /// A checker with the fingers open, for leaving a goal where the tool releases what it holds; `None` if it holds nothing.
     pub(super) fn with_open_fingers(&self) -> Option<Checker<'a>> {
         let scene = contact::let_go(self.scene)?;
         let opened = Configuration { finger: self.robot.open_finger_m(), ..self.request.start };
         Some(checker(self.robot, &scene, self.request, &opened, self.seen.as_ref(), self.checker.padding()))
     }
 
-    /// What touches what, or has less room than the padding.
+    /// The first forbidden contact in a posture, or distance below the padding.
     pub(super) fn collision(&mut self, posture: &JointVector, contact: Contact) -> Option<Collision> {
         self.checker.collision(posture, contact)
     }
 
-    /// The same on a straight motion of the joints, where nothing may touch.
+    /// The same for a straight motion of the joints without any contact.
     pub(super) fn edge_collision(&mut self, from: &JointVector, to: &JointVector) -> Option<Collision> {
         self.checker.edge_collision(from, to, Contact::None)
     }
 
-    /// What a straight part touches first that it may not.
+    /// The first forbidden contact on a straight part.
     pub(super) fn straight_collision(&mut self, postures: &[JointVector], press_m: f64) -> Option<Collision> {
         contact::straight_collision(&mut self.checker, postures, press_m)
     }
 
-    /// Postures along a straight part from the first of them, where the fingers and what they hold may press so deep; or what ends it early. An arm
-    /// that has a joint more than a pose needs goes round what is in the way of its elbow.
+    /// Postures along a straight part that begins in `from`, where the fingers and what they hold may penetrate by `press_m`; or why it ends
+    /// early. An arm with a redundant joint moves its elbow around obstacles.
     pub(super) fn leave(
         &mut self,
         from: &JointVector,
@@ -211,7 +211,7 @@ impl<'a> ArmInScene<'a> {
             met.as_ref().map_or(Ok(()), |collision| Err(collision.to_string()))
         };
         let mut traced = line::nearest(reach, &lines, from, is_free, &mut || pace.answer())?;
-        // Another elbow does not help what the tool itself meets.
+        // Another posture of the elbow does not help if the tool itself collides.
         let is_in_vain = met.is_some_and(|collision| self.checker.is_of_the_tool(&collision));
         if traced.ended.is_some() && !is_in_vain {
             let checker = &mut self.checker;
@@ -226,12 +226,12 @@ impl<'a> ArmInScene<'a> {
         })
     }
 
-    /// What the gripper touches in a posture, to be left from there; `None` where it touches nothing.
+    /// The gripper's contacts in a posture, which a retreat has to leave; `None` without contact.
     pub(super) fn leaving(&mut self, from: &JointVector) -> Option<Leaving> {
         Leaving::from(&mut self.checker, from)
     }
 
-    /// Postures along a straight part that leaves what the gripper touches at its beginning, the last of them free; or what ends it early.
+    /// Postures along a straight part that leaves the contacts of the gripper at its start and ends free; or why it ends early.
     pub(super) fn retreat(
         &mut self,
         from: &JointVector,
@@ -267,19 +267,19 @@ impl<'a> ArmInScene<'a> {
         Ok(end.map_or(Ok(postures), |collision| Err(format!("at its end {collision}"))))
     }
 
-    /// Postures along a straight part that ends in a posture, against its direction, each solved from the one before: from another posture at the
-    /// goal it may be followed, and those are tried anyway.
+    /// Postures along a straight part that ends in `from`, in the opposite direction, each solved from the one before. Other postures at the goal
+    /// are candidates, too, so no other elbow is tried.
     pub(super) fn line_back(&self, from: &JointVector, part: &Straight) -> Result<Vec<JointVector>, LineError> {
         arm::line_of_nearest(&self.reach, from, self.way(part, from).map(|c| -c))
     }
 
-    /// The tool's way along a straight part, in the frame of the base.
+    /// Translation of the tool along a straight part, in the frame of the base.
     fn way(&self, part: &Straight, at: &JointVector) -> [f64; 3] {
-        // A request that names an object which is not there has been refused.
+        // A request that names a missing object has been refused before.
         part.way(self.scene, &self.base, &self.reach.pose(at)).unwrap_or_default()
     }
 
-    /// From a posture in straight lines of the tool through way points to a goal.
+    /// Postures along straight lines of the tool from a posture through way points to a goal.
     pub(super) fn follow(
         &mut self,
         start: &JointVector,
@@ -299,25 +299,25 @@ impl<'a> ArmInScene<'a> {
         follower.follow(start, self.request, way, pace)
     }
 
-    /// All postures at a pose of the tool in the world frame.
+    /// All postures for a pose of the tool in the world frame.
     pub(super) fn postures(&self, pose: &Pose) -> Postures {
         self.reach.postures(&Target::at(self.base.inverse().compose(pose)))
     }
 
-    /// Some of them, the nearest to `near` first; every attempt gives others.
+    /// Some of these postures, the nearest to `near` first; every attempt returns others.
     pub(super) fn attempt(&mut self, postures: &Postures, near: &JointVector, attempt: usize) -> Vec<JointVector> {
         self.reach.attempt(postures, near, attempt, &mut self.random)
     }
 
-    /// The one of them that is nearest to a posture.
+    /// The nearest of these postures to `near`.
     pub(super) fn nearest(&self, postures: &Postures, near: &JointVector) -> Option<JointVector> {
         self.reach.nearest(postures, near).first().copied()
     }
 
-    /// From now on the tool keeps what the request wants, from this posture on.
+    /// Applies the request's constraint on the tool from the end of the departure on.
     ///
     /// # Errors
-    /// What is broken on the departure, which ends there.
+    /// Names the constraint that the departure violates.
     pub(super) fn keep_from(&mut self, departure: &[JointVector]) -> Result<(), PlanError> {
         let start = departure[departure.len() - 1];
         let tool = self.reach.pose(&start);
@@ -331,7 +331,7 @@ impl<'a> ArmInScene<'a> {
         self.kept_at(&state(&start)).map_err(|reason| PlanError::NotKept { place: "at the start", reason })
     }
 
-    /// What the tool keeps is kept at a posture, or what is broken.
+    /// Checks the constraint on the tool at a posture; the error names what is violated.
     pub(super) fn kept_at(&self, at: &State) -> Result<(), String> {
         match self.constraint.as_ref().filter(|constraint| !constraint.holds(at)) {
             Some(constraint) => Err(constraint.breach(at)),
@@ -339,7 +339,7 @@ impl<'a> ArmInScene<'a> {
         }
     }
 
-    /// What the tool keeps is kept along postures, or what is broken.
+    /// Checks the constraint on the tool along postures; the error names what is violated.
     pub(super) fn kept_along(&self, postures: &[JointVector]) -> Result<(), String> {
         let Some(constraint) = &self.constraint else { return Ok(()) };
         let breaks = |pair: &&[JointVector]| !constraint.holds_along(&state(&pair[0]), &state(&pair[1]));
@@ -349,7 +349,8 @@ impl<'a> ArmInScene<'a> {
         }
     }
 
-    /// Has the meshes looked at of which the spheres find no room in a posture where the meshes do; whether any are.
+    /// Adds the couples whose spheres collide in a posture though their meshes do not to those checked by exact shapes. Returns whether any
+    /// couples are checked that way.
     pub(super) fn tells_apart_at(&mut self, posture: &JointVector) -> bool {
         if self.search.doubt_at(posture) {
             self.look_at_unseen();
@@ -357,8 +358,8 @@ impl<'a> ArmInScene<'a> {
         self.search.tells_apart()
     }
 
-    /// The same of what is in the way between two postures, and elsewhere, where no way was found, or one on which something meets; whether there is more of
-    /// it than before.
+    /// Does the same for the straight motion between two postures and for random postures, after a search without a path or with a path that
+    /// collides. Returns whether there are new couples.
     pub(super) fn doubt_between(&mut self, from: &JointVector, to: &JointVector) -> bool {
         let is_new = self.search.doubt_between(from, to);
         if is_new {
@@ -367,7 +368,7 @@ impl<'a> ArmInScene<'a> {
         is_new
     }
 
-    /// The posture itself where the vector checks find room for it, else one close by that can be reached from it.
+    /// The posture itself if the vector checks find room for it, or else a close one that can be reached from it.
     pub(super) fn door(&mut self, posture: &JointVector) -> Option<State> {
         let here = state(posture);
         let space = &mut self.search.space;
@@ -386,17 +387,17 @@ impl<'a> ArmInScene<'a> {
         })
     }
 
-    /// What is so near in a posture that touches nothing that the vector checks find no room.
+    /// What is too close for the vector checks in a posture that touches nothing.
     pub(super) fn crowding(&self, posture: &JointVector) -> Option<String> {
         self.search.crowding(posture)
     }
 
-    /// About how long a motion along postures takes, in seconds.
+    /// Estimated duration of a motion along postures, in seconds.
     pub(super) fn lasts_s(&mut self, path: &[State]) -> f64 {
         self.rough.duration_s(path)
     }
 
-    /// A free path from a door to one of others.
+    /// A free path from a door to one of several others.
     pub(super) fn connect(
         &mut self,
         from: &State,
@@ -411,7 +412,7 @@ impl<'a> ArmInScene<'a> {
         }
     }
 
-    /// A free path with fewer and shorter motions.
+    /// Simplifies a free path: fewer and shorter motions.
     pub(super) fn shorten(&mut self, path: &mut Vec<State>, pace: &mut Pace<'_>) -> Result<(), Stop> {
         let control = &mut |_: usize| pace.answer();
         if let Some(constraint) = &self.constraint {
@@ -427,7 +428,7 @@ impl<'a> ArmInScene<'a> {
         Ok(())
     }
 
-    /// The improvement of a free path to the first of the ends, by its duration.
+    /// Improvement of a free path to the first of the ends, by its duration.
     pub(super) fn refinement(&self, path: Vec<State>, end: usize, ends: Vec<End>) -> Refinement {
         let measure = Measure::Duration(Box::new(self.rough.clone()));
         let refinement = Refinement::new(path, end, ends, measure, self.request.seed);
@@ -437,13 +438,13 @@ impl<'a> ArmInScene<'a> {
         }
     }
 
-    /// One step of it.
+    /// One step of the improvement.
     pub(super) fn step(&mut self, refinement: &mut Refinement, pace: &mut Pace<'_>) -> Result<(), Stop> {
         Ok(refinement.step(&mut self.search.space, &mut |_| pace.answer())?)
     }
 
-    /// The sections as one motion within the limits that were asked for, which keeps what is to be kept between all its knots as well, and on which
-    /// no two links meet that the search does not look at.
+    /// Times the sections as one motion within the requested limits. The motion keeps the constraint between all its knots as well, and the
+    /// couples that the search leaves out do not collide on it.
     pub(super) fn timed(
         &mut self,
         sections: &[Section],
@@ -466,13 +467,13 @@ impl<'a> ArmInScene<'a> {
                 }),
         };
         let curve = request.tool_speed.within(&self.reach, &request.speed.into(), &mut time)?;
-        // No link of the robot may press another one; what the gripper may press the straight parts have been looked at for.
+        // No link of the robot may press another one. What the gripper may press was checked on the straight parts.
         let contacts = [Contact::None, Contact::Gripper(CONTACT_TOLERANCE_M)];
         for (unseen, contact) in self.unseen.iter_mut().zip(contacts) {
             let looked_at = unseen.as_mut().map(|unseen| check_collisions_while(unseen, &curve, contact, goes_on));
             match looked_at.unwrap_or(Ok(true)) {
                 Ok(true) => {}
-                // Time is no limit of the first motion: what ends its check is that the caller does not want it any more.
+                // The time limit does not apply to the first motion: only cancellation by the caller ends its check.
                 Ok(false) => return Err(PlanError::Cancelled),
                 Err(violation) => return Err(PlanError::Unseen { reason: violation.to_string() }),
             }

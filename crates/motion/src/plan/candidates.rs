@@ -1,4 +1,4 @@
-//! The candidates for the end of the free path: every posture at a goal from which the approach is free, with that approach.
+//! Candidates for the end of the free path: every posture at a goal from which the approach is free, with that approach.
 
 use super::arm_in_scene::ArmInScene;
 use super::contact::{presses_m, straight_collision};
@@ -13,26 +13,26 @@ use crate::space::{State, state};
 use ratn_model::pose::Pose;
 use std::ops::Index;
 
-/// Postures looked for per goal pose, and attempts spent on it: at first, and once more if there were none.
+/// Postures searched per goal pose, and attempts spent on it: at first, and once more if none was found.
 const SOLUTIONS: [(usize, usize); 2] = [(6, 8), (40, 80)];
 
-/// Postures taken from one attempt: the nearest that it gives.
+/// Number of postures taken from one attempt: the nearest ones.
 const SOLUTIONS_PER_ATTEMPT: usize = 2;
 
-/// The most candidates.
+/// Maximum number of candidates.
 const MAX_CANDIDATES: usize = 64;
 
 /// A posture at the goal, with the straight part that leads to it.
 #[derive(Debug, Clone)]
 pub(super) struct Candidate {
-    /// Where the free path ends.
+    /// The end of the free path.
     pub(super) door: State,
-    /// From there to the goal: the way in where the approach begins with little room, and the approach; at least one posture.
+    /// From the door to the goal: a way in if the approach begins with little room, and the approach, which has at least one posture.
     pub(super) way_in: Option<JointVector>,
     pub(super) approach: Vec<JointVector>,
-    /// Length of both.
+    /// Length of both, in radians.
     pub(super) length_rad: f64,
-    /// How long both take, roughly.
+    /// Estimated duration of both, in seconds.
     lasts_s: f64,
 }
 
@@ -50,19 +50,19 @@ impl Candidate {
 /// Why a posture at a goal is no candidate.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub(super) enum Refusal {
-    /// The vector checks find no room where this approach begins.
+    /// The vector checks find no room at the start of this approach.
     #[error("there is too little room before the goal")]
     Crowded(Vec<JointVector>),
-    /// For people.
+    /// A message for people.
     #[error("{0}")]
     Other(String),
 }
 
-/// The candidates of one request; their numbers stay.
+/// The candidates of one request; their indices do not change.
 pub(super) struct Candidates<'a> {
-    /// How deep an approach may press into what it touches.
+    /// Allowed penetration of an approach, in metres.
     press_m: f64,
-    /// The tool as it leaves a goal where it lets go of what it holds.
+    /// The checker for leaving a goal where the tool releases what it holds.
     leaving: Option<Checker<'a>>,
     found: Vec<Candidate>,
 }
@@ -76,7 +76,7 @@ impl Index<usize> for Candidates<'_> {
 }
 
 impl<'a> Candidates<'a> {
-    /// Those that keep away from what they need not touch, or else those that press the least; the nearest to a posture first.
+    /// Candidates that keep a distance from what they need not touch, or else those with the smallest penetration; the nearest to a posture first.
     pub(super) fn find(
         arm: &mut ArmInScene<'a>,
         near: &JointVector,
@@ -101,7 +101,7 @@ impl<'a> Candidates<'a> {
                 }
                 let is_in_vain = candidates.found.is_empty();
                 for approach in crowded {
-                    // Only where nothing else is left: what is told apart by meshes makes the search slower.
+                    // Only as a last resort: couples checked by meshes make the search slower.
                     let is_told_apart = is_in_vain && arm.tells_apart_at(&approach[0]);
                     let mended = if is_told_apart { with_door(arm, approach) } else { Err(Refusal::Crowded(approach)) };
                     match mended {
@@ -123,12 +123,12 @@ impl<'a> Candidates<'a> {
         Err(PlanError::NoGoal { goals: arm.request().goals.len(), reasons })
     }
 
-    /// Where the free path may end, by number.
+    /// The possible ends of the free path, by index.
     pub(super) fn doors(&self) -> Vec<State> {
         self.found.iter().map(|candidate| candidate.door).collect()
     }
 
-    /// The same with what follows.
+    /// The doors with the length and duration of what follows.
     pub(super) fn ends(&self) -> Vec<End> {
         self.found.iter().map(Candidate::end).collect()
     }
@@ -141,7 +141,7 @@ impl<'a> Candidates<'a> {
         self.found.push(candidate);
     }
 
-    /// The goal posture with its approach, or why it is none.
+    /// The candidate of a goal posture, or why there is none.
     pub(super) fn candidate(&mut self, arm: &mut ArmInScene<'a>, goal: &JointVector) -> Result<Candidate, Refusal> {
         let part = &arm.request().approach;
         let mut approach = vec![*goal];
@@ -166,7 +166,7 @@ impl<'a> Candidates<'a> {
     }
 }
 
-/// Postures at the goals, and why there are none at some of them.
+/// Postures at the goals, and the reasons for goals without any.
 fn goal_postures(
     arm: &mut ArmInScene<'_>,
     near: &JointVector,
@@ -192,7 +192,7 @@ fn goal_postures(
     Ok(postures)
 }
 
-/// As [`Reach::solutions`](crate::reach::Reach::solutions), asking between the attempts whether to go on.
+/// As [`Reach::solutions`](crate::reach::Reach::solutions), but asks the caller between attempts whether to go on.
 fn postures_at(
     arm: &mut ArmInScene<'_>,
     pose: &Pose,

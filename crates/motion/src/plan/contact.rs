@@ -5,14 +5,13 @@ use crate::joint_vector::JointVector;
 use crate::robot::Robot;
 use ratn_world::scene::{Placement, Scene, SceneObject};
 
-/// How far off the measured poses of objects are, in metres: as far as that the fingers keep away from what they need not touch, where
-/// there is a way.
+/// Error of the measured poses of objects, in metres. The fingers keep this distance from what they need not touch, if there is a way.
 const MEASURED_WITHIN_M: f64 = 0.002;
 
-/// Steps from touching to the deepest that may be pressed: of the ways to a goal those count that press the least.
+/// Number of steps from touching to the deepest penetration allowed; of the ways to a goal those with the smallest penetration are used.
 const PRESS_STEPS: u32 = 4;
 
-/// What a straight part touches first that it may not.
+/// The first forbidden contact on a straight part.
 pub(crate) fn straight_collision(
     checker: &mut Checker<'_>,
     postures: &[JointVector],
@@ -23,21 +22,21 @@ pub(crate) fn straight_collision(
     first.or_else(|| postures.windows(2).find_map(|w| checker.edge_collision(&w[0], &w[1], contact)))
 }
 
-/// How deep the fingers and what they hold may press into what they touch on the way to a goal, in metres, in the order in which it is
-/// tried; negative: how far they keep away. The deepest is half a finger's thickness: a finger that comes down beside an edge pushes
-/// it aside, and one that comes down with more than half of itself on it stands on it.
+/// Allowed penetrations of the fingers and what they hold on the way to a goal, in metres, in the order in which they are tried; negative: a
+/// distance to keep. The greatest is half a finger's thickness: a finger that comes down beside an edge pushes it aside, and one that comes down
+/// with more than half of its thickness on it stands on it.
 pub(super) fn presses_m(robot: &Robot) -> Vec<f64> {
     let steps = (0..=PRESS_STEPS).map(|step| f64::from(step) / f64::from(PRESS_STEPS) * half_finger_m(robot));
     std::iter::once(-MEASURED_WITHIN_M).chain(steps).collect()
 }
 
-/// Half of a finger's thickness along the direction in which it closes; 0 for a robot without fingers.
+/// Half of a finger's thickness along its closing direction, in metres; 0 for a robot without fingers.
 pub(super) fn half_finger_m(robot: &Robot) -> f64 {
     robot.finger_parts().iter().map(|part| part.half[1]).fold(0.0, f64::max)
 }
 
-/// The scene as the tool leaves a goal where it lets go of what it holds: fingers that open there may press a neighbour, too. `None` where
-/// it holds nothing.
+/// The scene in which the tool leaves a goal where it releases what it holds: fingers that open there may press a neighbour, too. `None` if it
+/// holds nothing.
 pub(super) fn let_go(scene: &Scene) -> Option<Scene> {
     let is_held = |object: &SceneObject| matches!(object.placement, Placement::Gripper(_));
     if !scene.objects.iter().any(is_held) {

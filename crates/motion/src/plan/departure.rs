@@ -8,8 +8,8 @@ use crate::collision::{CONTACT_TOLERANCE_M, Contact};
 use crate::joint_vector::JointVector;
 use crate::pace::Pace;
 
-/// Its postures, one where there is no such part; the last of them is free. With as much padding as the start has. Where the gripper is in something
-/// at the start, and cannot depart as it was asked to, it retreats from there.
+/// The postures of the departure, only the start if none was requested; the last one is free. Planned with the greatest padding that the start
+/// allows. If the gripper is inside an object at the start and cannot depart as requested, it retreats.
 pub(super) fn departure(arm: &mut ArmInScene<'_>, pace: &mut Pace<'_>) -> Result<Vec<JointVector>, PlanError> {
     match with_paddings(arm, pace, padded_departure)? {
         Ok(postures) => Ok(postures),
@@ -30,7 +30,7 @@ fn starts_as_departures_may(arm: &mut ArmInScene<'_>) -> bool {
     arm.request().depart.is_some() && arm.collision(&start, Contact::Gripper(CONTACT_TOLERANCE_M)).is_none()
 }
 
-/// The first way that there is, with the greatest padding that allows one, or why there is none with the least.
+/// The result with the greatest padding that allows one, or the error with the smallest padding.
 fn with_paddings<'a, T>(
     arm: &mut ArmInScene<'a>,
     pace: &mut Pace<'_>,
@@ -57,7 +57,7 @@ fn padded_departure(arm: &mut ArmInScene<'_>, pace: &mut Pace<'_>) -> Result<Vec
         };
     }
     let failed = |reason: String| PlanError::Depart { part: part.to_string(), reason };
-    // It is looked at with the most that may be pressed: as on an approach, or what is pressed already.
+    // Checked with the greatest penetration allowed: as on an approach, or more if the start is deeper already.
     let usual_m = half_finger_m(arm.robot());
     let is_deep = arm.collision(&start, Contact::Gripper(usual_m)).is_some();
     let press_m = if is_deep { CONTACT_TOLERANCE_M } else { usual_m };

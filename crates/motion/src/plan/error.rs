@@ -4,7 +4,7 @@ use crate::cloud::CloudError;
 use crate::collision::Collision;
 use crate::pace::Stop;
 
-/// How many different reasons an error names.
+/// Maximum number of different reasons in an error.
 pub(super) const MAX_REASONS: usize = 5;
 
 /// Why there is no plan.
@@ -13,89 +13,89 @@ pub enum PlanError {
     /// A part of the request is out of range or contradicts the robot.
     #[error("{what} is {value}: expected {expected}")]
     Malformed {
-        /// Which part of it.
+        /// The part of the request.
         what: String,
-        /// What it is.
+        /// Its value.
         value: String,
-        /// What it should be.
+        /// The expected value.
         expected: String,
     },
-    /// What was seen is too far away.
+    /// The point cloud is too far away.
     #[error("`cloud`: {0}")]
     Seen(#[from] CloudError),
-    /// The arm touches something where it stands.
+    /// The arm is in collision at the start.
     #[error("at the start {collision}")]
     StartInCollision {
-        /// What touches what.
+        /// The collision.
         collision: Collision,
     },
-    /// The gripper touches something where the arm stands, and no straight way out of it is free.
+    /// The gripper is in contact at the start, and no straight way out of it is free.
     #[error("at the start {collision}, and it cannot be left: {}", reasons.join("; "))]
     NoRetreat {
-        /// What is touched deepest.
+        /// The deepest contact.
         collision: Collision,
-        /// Which ways were tried, and what ends each of them.
+        /// The ways that were tried, and what ends each of them.
         reasons: Vec<String>,
     },
     /// The straight part at the start cannot be followed.
     #[error("departing {part}: {reason}")]
     Depart {
-        /// How far it should go, and where.
+        /// Its direction and length.
         part: String,
-        /// What is in the way.
+        /// What ends it.
         reason: String,
     },
-    /// The start is free, but nothing around it.
+    /// The start is free, but has no room around it.
     #[error("at the start {reason}")]
     NoRoom {
-        /// What is close.
+        /// What is too close.
         reason: String,
     },
-    /// No alternative of the goal has a posture that is free.
+    /// No alternative of the goal has a free posture.
     #[error("none of the {goals} goals can be reached: {}", reasons.join("; "))]
     NoGoal {
-        /// How many alternatives there were.
+        /// Number of alternatives.
         goals: usize,
         /// The different reasons.
         reasons: Vec<String>,
     },
-    /// The tool reaches none of the goals in a straight line.
+    /// The tool reaches no goal in a straight line.
     #[error("no straight way to any of the {goals} goals: {}", reasons.join("; "))]
     NoStraightWay {
-        /// How many alternatives there were.
+        /// Number of alternatives.
         goals: usize,
-        /// How far the tool gets and why no further, of some of them.
+        /// For some of them, how far the tool gets and what ends the line.
         reasons: Vec<String>,
     },
-    /// A constraint on the tool is broken where it has to hold.
+    /// A constraint on the tool is violated where it has to hold.
     #[error("{place} {reason}")]
     NotKept {
-        /// Where.
+        /// Where on the motion.
         place: &'static str,
-        /// What is broken.
+        /// The violation.
         reason: String,
     },
-    /// By the shapes something meets on the way that was found, where the search has looked at some postures of it alone.
+    /// The path found has a collision by the exact shapes: the search checks some couples only at some postures.
     #[error(
         "on the way that was found, {reason}, on a straight part or between the postures that the search has looked at: pass a posture aside"
     )]
     Unseen {
-        /// When, and which.
+        /// The time and the collision.
         reason: String,
     },
-    /// There are goals, but no way was found.
+    /// There are goal postures, but no path was found.
     #[error(
         "no way found to any of {postures} goal postures after {iterations} iterations; on the straight way {collision}"
     )]
     NoPath {
-        /// How many goal postures were tried.
+        /// Number of goal postures tried.
         postures: usize,
-        /// Iterations of the search.
+        /// Number of iterations of the search.
         iterations: usize,
-        /// What blocks the straight way to the nearest of them.
+        /// The collision on the straight way to the nearest goal posture.
         collision: String,
     },
-    /// The caller's time was up before there was any path.
+    /// The caller's time was up before a path was found.
     #[error("no path was found in the time given")]
     TimeUp,
     /// The caller cancelled the planning.

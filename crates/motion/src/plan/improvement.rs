@@ -1,5 +1,5 @@
-//! Makes the motion quicker while the caller gives time: other free paths and other candidates, compared by how long they roughly take, and
-//! taken where the whole motion, timed exactly, is quicker.
+//! Anytime improvement of the motion: other free paths and other candidates, compared by an estimate of their duration, and adopted if the whole
+//! motion, timed exactly, is quicker.
 
 use super::Plan;
 use super::arm_in_scene::ArmInScene;
@@ -18,20 +18,20 @@ use rand::RngExt;
 use ratn_model::pose::Pose;
 use std::ops::Range;
 
-/// Of a hundred steps of improvement, those that look for a new candidate.
+/// Percentage of improvement steps that look for a new candidate.
 const NEW_CANDIDATES: i32 = 8;
 
-/// A path must have become this much quicker to be reported, in seconds.
+/// A quicker path is reported only if it gains at least this, in seconds.
 const LEAST_REPORT_S: f32 = 1e-3;
 
-/// The motion is timed exactly after so many steps of improvement, and after four times as many, again and again.
+/// The motion is timed exactly after this many steps of improvement, and again whenever their number has grown fourfold.
 const FIRST_TIMED: usize = 64;
 const TIMED_AGAIN: usize = 4;
 
-/// How much of a straight part a blend may take, at the end that is away from what it leads to or from.
+/// Maximum share of a straight part that a blend may take, at the end that joins the free path.
 const BLENDED_SHARE: f64 = 0.5;
 
-/// How far from the present path a posture is looked for from which another goal posture is near, in radians per joint.
+/// Another goal posture is searched near a posture that is off the current path by at most this, in radians per joint.
 const ASIDE_RAD: f64 = 0.5;
 
 /// A free path from the door at the start to that of a candidate.
@@ -41,29 +41,29 @@ pub(super) struct Way {
     pub(super) candidate: usize,
 }
 
-/// A way, and the whole motion along it.
+/// A way, and the timed motion along it.
 pub(super) struct Motion {
     pub(super) way: Way,
     pub(super) curve: Curve,
 }
 
-/// What is fixed before improvement begins.
+/// What is fixed before the improvement begins.
 pub(super) struct Before<'p> {
     /// The straight part at the start.
     pub(super) depart: &'p [JointVector],
-    /// How long that is, with the way to the door behind it.
+    /// Length of the straight part with the way to the door.
     pub(super) length_rad: f64,
-    /// How long the first path is, straight parts included.
+    /// Length of the first path, straight parts included.
     pub(super) first_length_rad: f64,
 }
 
-/// Improvement under way.
+/// The state of the improvement.
 pub(super) struct Improvement<'p, 'a> {
     arm: &'p mut ArmInScene<'a>,
     candidates: &'p mut Candidates<'a>,
     before: Before<'p>,
     first_duration_s: f64,
-    /// How long the motion took that was reported last as usable.
+    /// Duration of the motion reported last as usable.
     usable_s: Option<f64>,
 }
 
@@ -76,7 +76,7 @@ impl<'p, 'a> Improvement<'p, 'a> {
         Improvement { arm, candidates, before, first_duration_s: 0.0, usable_s: None }
     }
 
-    /// The quickest motion found, if only that along the first path: to be timed is part of every plan, also when time is up.
+    /// Returns the quickest motion found, or else the one along the first path. The timing is done in any case, even if time is up.
     pub(super) fn run(mut self, first: Way, pace: &mut Pace<'_>) -> Result<Plan, PlanError> {
         let mut shorter = first.clone();
         let reported = pace.report(Progress::FirstPath { length_rad: self.before.first_length_rad });
@@ -87,7 +87,7 @@ impl<'p, 'a> Improvement<'p, 'a> {
         let mut stopped = shortened.err();
         let timed = self.motion(shorter, &mut not_cancelled(pace));
         let Ok(mut motion) = timed else {
-            // A shorter path that cannot be timed so that the tool keeps what it is to keep is no start for improvement.
+            // A shortened path whose timing would violate the constraint on the tool cannot be improved.
             let motion = self.motion(first, &mut not_cancelled(pace))?;
             self.first_duration_s = motion.curve.duration_s();
             return self.finished(&motion, stopped, pace);
@@ -121,7 +121,7 @@ impl<'p, 'a> Improvement<'p, 'a> {
         }
     }
 
-    /// As many steps of improvement as were asked for; from time to time what they have led to is timed.
+    /// Does the requested number of improvement steps, and times the result now and then.
     fn refine(&mut self, best: &mut Motion, pace: &mut Pace<'_>) -> Result<(), Stop> {
         let Way { path, candidate } = best.way.clone();
         let mut refinement = self.arm.refinement(path, candidate, self.candidates.ends());
@@ -136,7 +136,7 @@ impl<'p, 'a> Improvement<'p, 'a> {
         stopped
     }
 
-    /// Until the steps are done, or the caller is content with what is there.
+    /// Steps until all are done, or the caller has settled for the current motion.
     fn steps(
         &mut self,
         steps: &mut Range<usize>,
@@ -169,17 +169,17 @@ impl<'p, 'a> Improvement<'p, 'a> {
         Ok(())
     }
 
-    /// The best so far is used already, as far as where it ends: the rest of the steps make the way there quicker.
+    /// The caller already uses the best motion, including its end: the remaining steps make only the way to that end quicker.
     fn refine_usable(&mut self, steps: &mut Range<usize>, best: &mut Motion, pace: &mut Pace<'_>) -> Result<(), Stop> {
         self.report_usable(best, pace)?;
-        // Of all ends only its own, so it is the first.
+        // Only the end of this candidate, so its index is 0.
         let Way { path, candidate } = best.way.clone();
         let mut refinement = self.arm.refinement(path, 0, vec![self.candidates[candidate].end()]);
         let mut timed_s = refinement.cost();
         for _ in steps {
             pace.iteration()?;
             self.arm.step(&mut refinement, pace)?;
-            // It is timed only where that may be worth a report: that takes longer than many steps.
+            // Timed only if the result may be worth a report, because timing takes longer than many steps.
             if refinement.cost() < timed_s * (1.0 - BETTER as f32) {
                 timed_s = refinement.cost();
                 let way = Way { path: refinement.path().to_vec(), candidate };
@@ -192,7 +192,7 @@ impl<'p, 'a> Improvement<'p, 'a> {
         Ok(())
     }
 
-    /// Reports a motion that is the first to be usable, or noticeably quicker than the one before.
+    /// Reports the first usable motion, and later ones that are noticeably quicker.
     fn report_usable(&mut self, best: &Motion, pace: &mut Pace<'_>) -> Result<(), Stop> {
         let lasts_s = best.curve.duration_s();
         if self.usable_s.is_some_and(|usable_s| lasts_s > usable_s * (1.0 - BETTER)) {
@@ -203,7 +203,7 @@ impl<'p, 'a> Improvement<'p, 'a> {
         pace.report(Progress::Usable(&plan))
     }
 
-    /// Times the path of a refinement, and takes it where the motion is quicker: never one that is slower, whatever the estimate says.
+    /// Times the path of a refinement, and adopts it if the motion is quicker: never a slower one, whatever the estimate says.
     fn time_if_new(&mut self, refinement: &Refinement, best: &mut Motion, goes_on: &mut dyn FnMut() -> bool) {
         let way = Way { path: refinement.path().to_vec(), candidate: refinement.end() };
         self.take_if_quicker(way, best, goes_on);
@@ -236,7 +236,7 @@ impl<'p, 'a> Improvement<'p, 'a> {
         Ok(Motion { way, curve })
     }
 
-    /// The free path with its ways out and in, from the end of the departure to the beginning of the approach.
+    /// The free path with its ways out and in, from the end of the departure to the start of the approach.
     fn whole(&self, path: &[State], candidate: &Candidate) -> Vec<JointVector> {
         let start = self.before.depart[self.before.depart.len() - 1];
         let mut whole: Vec<JointVector> = path.iter().map(|s| self.arm.joints(s)).collect();
@@ -253,7 +253,7 @@ impl<'p, 'a> Improvement<'p, 'a> {
         whole
     }
 
-    /// Looks for a posture at the goal that a quicker path could lead to.
+    /// Looks for a goal posture that a quicker path could lead to.
     fn find_another(&mut self, refinement: &mut Refinement) {
         let goals = &self.arm.request().goals;
         let Goal::Pose(pose) = &goals[self.arm.random().random_range(0..goals.len())] else { return };
@@ -264,7 +264,7 @@ impl<'p, 'a> Improvement<'p, 'a> {
         let near = self.arm.joints(&refinement.point(along).0);
         let seed = near.map(|q| q + self.arm.random().random_range(-ASIDE_RAD..ASIDE_RAD));
         let Some(posture) = self.arm.nearest(&self.arm.postures(pose), &seed) else { return };
-        // The posture itself is no end of the path, but where the end is cannot be much nearer.
+        // The posture itself is no end of the path, but the end cannot be much nearer.
         if !refinement.is_promising(&End { state: state(&posture), rest: 0.0, rest_s: 0.0 }) {
             return;
         }
@@ -276,8 +276,8 @@ impl<'p, 'a> Improvement<'p, 'a> {
     }
 }
 
-/// The share of the way of the joints along a straight part, at its far end, that is beyond what the tool has to follow: [`BLENDED_SHARE`] at
-/// the most. `tools` has the tool at each posture.
+/// Share of the joint motion along a straight part, at its far end, that is beyond what the tool has to follow; at most [`BLENDED_SHARE`]. `tools`
+/// has the tool's pose at each posture.
 fn blended_share(postures: &[JointVector], tools: &[Pose]) -> f64 {
     let [first, .., last] = tools else { return BLENDED_SHARE };
     let followed_m = (1.0 - BLENDED_SHARE) * first.distance(last);

@@ -1,7 +1,7 @@
 //! A start in contact: the straight way out of it.
 //!
-//! What may be touched on the way, `leaving` says. Tried are the departure that was asked for, all of it; back along the tool's axis; and the
-//! shortest way out of what is touched deepest. The last two end in the first posture that is free.
+//! `leaving` decides which contacts are allowed on the way. Three ways are tried: the whole departure that was requested; back along the tool's
+//! axis; and the shortest way out of the deepest contact. The last two end at the first free posture.
 
 use super::arm_in_scene::{ArmInScene, Extent};
 use super::error::PlanError;
@@ -10,10 +10,10 @@ use crate::leaving::Leaving;
 use crate::pace::Pace;
 use crate::straight::{Frame, MAX_STRAIGHT_M, Straight};
 
-/// The postures of a retreat; `None` where the gripper touches nothing at the start.
+/// The postures of a retreat; `None` if the gripper touches nothing at the start.
 ///
 /// # Errors
-/// Why no way out of what it touches can be followed.
+/// Why no way out can be followed.
 pub(super) fn retreat(arm: &mut ArmInScene<'_>, pace: &mut Pace<'_>) -> Result<Option<Vec<JointVector>>, PlanError> {
     let start = arm.request().start.arm;
     let Some(leaving) = arm.leaving(&start) else { return Ok(None) };
@@ -27,7 +27,7 @@ pub(super) fn retreat(arm: &mut ArmInScene<'_>, pace: &mut Pace<'_>) -> Result<O
     Err(PlanError::NoRetreat { collision: leaving.told(), reasons })
 }
 
-/// The ways that are tried, the one that was asked for first, with what messages call them.
+/// The ways that are tried, the requested one first, each with its name in messages.
 fn ways(arm: &ArmInScene<'_>, leaving: &Leaving) -> Vec<(String, Straight, Extent)> {
     let asked = &arm.request().depart;
     let asked = asked.is_some().then(|| (format!("{asked}"), asked.clone(), Extent::Whole));

@@ -1,8 +1,9 @@
-//! What the search sees of an arm in its scene, and what of it is told apart by the shapes as they are.
+//! The space that the search uses for an arm in its scene, and the couples that are checked by exact shapes instead.
 //!
-//! The search sees spheres. Those of primitives stand out by no more than the planner keeps as room, those that hold a mesh by centimetres. So where such
-//! spheres touch what the shapes do not, in a posture where a motion is to begin or end or in any that is looked at after a search in vain, the couple is
-//! left out of the vector checks and confirmed by the shapes from then on ([`confirmed`](crate::confirmed)), as `ratn plan` does.
+//! The search uses spheres. Spheres of primitives stand out by no more than the planner's clearance, spheres of a mesh by centimetres. So a couple
+//! whose mesh spheres collide though the shapes do not is taken out of the vector checks and confirmed by the shapes from then on
+//! ([`confirmed`](crate::confirmed)), as `ratn plan` does. This is checked in postures where a motion is to begin or end, and in the postures
+//! examined after a failed search.
 
 use crate::arm::{self, BySpheres, CLEARANCE_M};
 use crate::cloud::Cloud;
@@ -19,18 +20,18 @@ use crate::surroundings::Surroundings;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-/// Postures that are looked at after a search in vain: along the straight way, and drawn.
+/// Number of postures examined after a failed search: along the straight way, and random ones.
 const ALONG: usize = 20;
 const DRAWN: usize = 200;
 
-/// See the module. All is in the frame of the base.
+/// See the module. All poses are in the frame of the base.
 pub(super) struct Search<'a> {
     robot: &'a Robot,
-    /// The arm with its shapes as they are, and what stands around it.
+    /// The arm with its exact shapes, and the obstacles around it.
     exact: Mechanism,
     around: Vec<Obstacle>,
     clouds: Vec<Cloud>,
-    /// What is told apart by the shapes.
+    /// The couples that are checked by exact shapes.
     confirmed: Couples,
     seen: BySpheres,
     pub(super) space: Space,
@@ -44,13 +45,13 @@ impl<'a> Search<'a> {
         Search { robot, exact, around, clouds, confirmed: Couples::default(), seen, space }
     }
 
-    /// The arm, with its shapes as they are.
+    /// The arm with its exact shapes.
     pub(super) fn mechanism(&self) -> &Mechanism {
         &self.exact
     }
 
-    /// What the vector checks do not look at, of a checker without padding: the pairs of links, and what links are beside of what stands around; `None` where
-    /// that is nothing.
+    /// The couples that the vector checks leave out, from a checker `all` without padding: pairs of links, and links with obstacles; `None` if
+    /// there are none.
     pub(super) fn unseen(&self, all: &Checker<'a>) -> [Option<Checker<'a>>; 2] {
         let mut pairs = Couples { pairs: arm::unseen(self.robot, &self.exact), ..Couples::default() };
         pairs.extend(Couples { pairs: self.confirmed.pairs.clone(), ..Couples::default() });
@@ -58,19 +59,20 @@ impl<'a> Search<'a> {
         [pairs, beside].map(|couples| (!couples.is_empty()).then(|| all.clone().of(&couples)))
     }
 
-    /// Whether anything is told apart by the shapes.
+    /// Whether any couple is checked by exact shapes.
     pub(super) fn tells_apart(&self) -> bool {
         !self.confirmed.is_empty()
     }
 
-    /// Whether spheres of meshes take for touching in a posture what the shapes keep apart, and that is new. It is told apart by the shapes from now on.
+    /// Finds couples whose mesh spheres collide in a posture though the shapes do not, and checks them by exact shapes from now on. Returns
+    /// whether there are new ones.
     pub(super) fn doubt_at(&mut self, posture: &JointVector) -> bool {
         let mistaken = self.mistaken(&mut [*posture].into_iter());
         self.confirm(mistaken)
     }
 
-    /// The same of all that is so on the straight way between two postures or in postures that are drawn, where a search was in vain; and of the pairs that it
-    /// does not look at.
+    /// As `doubt_at`, for the straight motion between two postures and for random postures, after a failed search; also adds the pairs that the
+    /// search skips.
     pub(super) fn doubt_between(&mut self, from: &JointVector, to: &JointVector) -> bool {
         let along = (0..=ALONG).map(|i| between(from, to, i as f64 / ALONG as f64));
         let mut random = ChaCha8Rng::seed_from_u64(1);
@@ -81,7 +83,7 @@ impl<'a> Search<'a> {
         self.confirm(doubts)
     }
 
-    /// The couples with meshes that spheres find touching in any of these postures though the shapes keep apart.
+    /// Couples with meshes whose spheres collide in one of these postures though the shapes do not.
     fn mistaken(&self, postures: &mut dyn Iterator<Item = JointVector>) -> Couples {
         let coarse = of_spheres(&self.seen.arm, ROUNDING_M);
         let obstacles = self.obstacles();
@@ -95,7 +97,7 @@ impl<'a> Search<'a> {
         mistaken
     }
 
-    /// Of what spheres find touching that of which one at least stands for a mesh; what stands of the robot as the link that it is.
+    /// Of the colliding couples those with at least one mesh. An obstacle that is a link of the robot is replaced by that link.
     fn of_meshes(&self, met: Couples) -> Couples {
         let is_mesh = |link: usize| self.exact.links[link].covers > 0;
         let mut of_meshes = Couples::default();
@@ -117,7 +119,7 @@ impl<'a> Search<'a> {
         of_meshes
     }
 
-    /// The link of the robot that stands there by this name among the obstacles.
+    /// The link of the robot that is the obstacle of this name.
     fn standing(&self, name: &str) -> Option<usize> {
         let index = self.seen.standing.iter().position(|obstacle| obstacle.name == name);
         index.map(|index| self.seen.links[index])
@@ -127,7 +129,7 @@ impl<'a> Search<'a> {
         self.seen.standing.iter().chain(&self.around).cloned().collect()
     }
 
-    /// Has more told apart by the shapes; whether that is any.
+    /// Adds couples to be checked by exact shapes; returns whether any is new.
     fn confirm(&mut self, doubts: Couples) -> bool {
         if !self.confirmed.extend(doubts) {
             return false;
@@ -139,7 +141,7 @@ impl<'a> Search<'a> {
         true
     }
 
-    /// What is so near in a posture that touches nothing that the vector checks find no room.
+    /// What is too close for the vector checks in a posture that touches nothing.
     pub(super) fn crowding(&self, posture: &JointVector) -> Option<String> {
         let coarse = of_spheres(&self.seen.arm, ROUNDING_M);
         let touches = Exact::new(&coarse, surroundings(&self.obstacles(), &self.clouds)).touches(posture);

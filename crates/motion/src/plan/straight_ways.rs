@@ -1,4 +1,4 @@
-//! Motions whose tool goes in straight lines all the way: tried with rounded corners, then with a stop at each; the quicker is taken.
+//! Motions whose tool moves in straight lines all the way: timed with rounded corners, then with a stop at each corner; the quicker one is taken.
 
 use super::Plan;
 use super::arm_in_scene::ArmInScene;
@@ -9,7 +9,7 @@ use crate::pace::{Control, Pace, Progress, Stop};
 use crate::timing::Section;
 use crate::way_points::WayPoints;
 
-/// The motion after a departure.
+/// Plans the motion after a departure.
 pub(super) fn plan_straight(
     arm: &mut ArmInScene<'_>,
     way: &WayPoints,
@@ -20,7 +20,7 @@ pub(super) fn plan_straight(
     let mut leaving = arm.with_open_fingers();
     let mut best: Option<Plan> = None;
     let mut failed = None;
-    // Within limits of jerk a corner that is rounded closely may take longer than a stop.
+    // With jerk limits, a corner rounded with a small radius may take longer than a stop.
     let blends = [way.blend_m, 0.0];
     for blend_m in blends.into_iter().take(if way.blend_m > 0.0 { 2 } else { 1 }) {
         let way = WayPoints { blend_m, ..way.clone() };

@@ -1,32 +1,33 @@
-//! The shapes of a finger as they stand in the tool's frame where the fingers meet: how thick a finger is, and where its pad is.
+//! The shapes of a finger in the tool's frame when the fingers are closed: how thick a finger is, and where its pad is.
 //!
-//! Nothing is assumed of how hand, finger and tool are mounted on each other: the description says that fingers close along the tool's y
-//! axis, and where the shapes are follows from the URDF. The pad of a mesh is what of it is flat, or nearly, where it is nearest to the other finger.
+//! Nothing is assumed about how hand, finger and tool are mounted on each other: the description defines that fingers close along the tool's y
+//! axis, and the URDF gives the positions of the shapes. The pad of a mesh is its flat, or nearly flat, part that is nearest to the other finger.
 
 use super::{Geometry, Robot, to_f32};
 use crate::mesh::Mesh;
 use crate::surface::cut;
 use ratn_model::pose::Pose;
 
-/// How far the faces of a box may be turned out of the tool's axes, as a part of a unit vector: rounding.
+/// Tolerance for faces of a box along the tool's axes, as a fraction of a unit vector: rounding.
 const ALIGNED: f64 = 1e-6;
 
-/// What of a mesh is no deeper than that behind the place that is nearest to the other finger is its pad: as far as pads give way, in metres.
+/// The pad of a mesh reaches this far behind the point nearest to the other finger, in metres: as far as pads give way.
 const PAD_DEEP_M: f64 = 0.002;
 
-/// One shape of a finger, as a cuboid along the axes of the tool's frame that holds it or, of a mesh, its pad; in metres.
+/// One shape of a finger, as an axis-aligned cuboid in the tool's frame that holds the shape or, for a mesh, its pad; in metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FingerPart {
-    /// The cuboid's middle, with the fingers where they meet.
+    /// The centre of the cuboid when the fingers are closed.
     pub middle: [f64; 3],
-    /// Half of its edges.
+    /// Half extents.
     pub half: [f64; 3],
-    /// It is a box whose faces lie along the tool's axes, the cuboid is the shape itself; or the pad of a mesh, as thick as the mesh is there.
+    /// Whether it is flat: a box whose faces lie along the tool's axes, so that the cuboid is the shape itself; or the pad of a mesh, as thick as
+    /// the mesh is there.
     pub is_flat: bool,
 }
 
 impl Robot {
-    /// The shapes of the finger that the description names; none of a robot without a gripper.
+    /// The shapes of the finger that the description names; none for a robot without a gripper.
     pub fn finger_parts(&self) -> Vec<FingerPart> {
         let (Some(finger), Some(joint)) = (self.finger_link(), self.finger.as_ref()) else { return Vec::new() };
         let mut positions = self.neutral.clone();
@@ -40,8 +41,8 @@ impl Robot {
         primitives.chain(meshes).collect()
     }
 
-    /// Each link that the gripper's joint moves, and how far it goes in the tool's frame from where the joint is at zero to where it is at its
-    /// upper limit; none of a robot without a gripper.
+    /// Each link that the gripper's joint moves, with its translation in the tool's frame between the joint at zero and at its upper limit; none
+    /// for a robot without a gripper.
     pub fn finger_ways(&self) -> Vec<(usize, [f64; 3])> {
         let Some(joint) = self.finger.as_ref() else { return Vec::new() };
         let places = [0.0, joint.joints[0].upper].map(|position| {
@@ -55,8 +56,8 @@ impl Robot {
         self.finger_links().into_iter().map(|link| (link, way(link))).collect()
     }
 
-    /// The poses of a link and of the tool in the frame of the last link that carries both. The links before that one are left out: they move
-    /// both alike, and would only add rounding errors.
+    /// The poses of a link and of the tool in the frame of the last link that carries both. The links before that one are left out: they move both
+    /// alike and would only add rounding errors.
     fn in_shared_link(&self, link: usize, positions: &[f64]) -> (Pose, Pose) {
         let links = &self.model.links;
         let above = |link: usize| std::iter::successors(Some(link), |index| links[*index].parent).collect::<Vec<_>>();
@@ -71,10 +72,10 @@ impl Robot {
     }
 }
 
-/// The pad of a mesh of a finger that opens along the tool's y, or against it where `outward` is below 0.
+/// The pad of a mesh of a finger that opens along the tool's y, or in the opposite direction if `outward` is negative.
 fn pad(pose: &Pose, mesh: &Mesh, outward: f64) -> FingerPart {
     let sign = if outward < 0.0 { -1.0 } else { 1.0 };
-    // As if it opened along y.
+    // Mirrored, if necessary, so that it opens along y.
     let seen = |corner: &[f64; 3]| {
         let [x, y, z] = pose.transform(*corner);
         [x, sign * y, z]
@@ -86,7 +87,7 @@ fn pad(pose: &Pose, mesh: &Mesh, outward: f64) -> FingerPart {
         triangles.iter().flat_map(|triangle| cut(triangle, 1, least[1] + PAD_DEEP_M, -1.0)).collect();
     let [mut inner, mut outer] = bounds(&front);
     inner[1] = least[1];
-    // As thick as it is behind the middle of the pad.
+    // The thickness is that behind the middle of the pad.
     let [x, z] = [0, 2].map(|i| (inner[i] + outer[i]) / 2.0);
     let behind = triangles.iter().filter_map(|triangle| at_line(triangle, x, z)).fold(f64::NEG_INFINITY, f64::max);
     outer[1] = if behind > inner[1] { behind } else { greatest[1] };
@@ -103,7 +104,7 @@ fn bounds(corners: &[[f64; 3]]) -> [[f64; 3]; 2] {
     ]
 }
 
-/// Where a line along y meets a triangle.
+/// The y at which a line along y meets a triangle.
 fn at_line(triangle: &[[f64; 3]; 3], x: f64, z: f64) -> Option<f64> {
     let [a, b, c] = triangle;
     let area = |p: &[f64; 3], q: &[f64; 3]| (p[0] - x) * (q[2] - z) - (q[0] - x) * (p[2] - z);

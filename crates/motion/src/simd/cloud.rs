@@ -1,50 +1,50 @@
-//! A cloud of points, ready for the question whether spheres touch any of its balls, for as many spheres at once as there are lanes.
+//! A point cloud prepared for the query whether spheres touch any of its balls, for as many spheres at once as there are lanes.
 //!
-//! A grid lies over the cloud. Every cell knows how far its centre is from the nearest point, and the points that are the nearest to
-//! any place in the cell: those that no other point keeps from it (a place is nearer to q than to p where it is on q's side of the plane
-//! between them; p is left out where the whole cell is). The lists are made by halving: a part of the grid passes on to its halves only
-//! what it has not left out. So the answer from the list of the cell that a centre is in is exact, for any radius; the distances of
-//! the cells' centres decide for most spheres that they touch nothing. What is beside the grid is further from the points than
-//! any sphere reaches for which there are lists; a larger sphere there counts as touching where the distances do not rule it out.
+//! A grid covers the cloud. Each cell stores the distance of its centre from the nearest point, and a list of the points that are the nearest to
+//! some place in the cell. (A place is nearer to q than to p if it is on q's side of the bisecting plane; p is dropped if the whole cell is on q's
+//! side.) The lists are made by bisection: a part of the grid passes on to its halves only the points that it has not dropped. So the answer from
+//! the list of the cell that a centre is in is exact, for any radius; for most spheres the distances of the cell centres already rule out a
+//! contact. Places outside the grid are further from the points than any sphere for which there are lists reaches; a larger sphere there counts as
+//! touching unless the distances rule it out.
 //!
-//! Balls may be all over the surface of something solid. Cells that are solid as a whole say so instead of a list; of others it is known in
-//! small cells which side of the surface they are on, which decides for a sphere that meets no ball.
+//! The balls may cover the surface of a solid. A cell that is wholly solid is marked instead of having a list; other cells are divided into small
+//! cells, each known to be inside or outside, which decides for a sphere that touches no ball.
 //!
-//! Nearest neighbours by cells with the sites of their Voronoi diagrams are old (Clarkson, SIAM J. Comput. 1988); that spheres of a robot
-//! are looked up in a structure laid out for vectors is from Ramsey, Kingston, Thomason, Kavraki: *Collision-Affording Point Trees* (RSS
-//! 2024), whose lists are of points within a greatest radius instead.
+//! Nearest neighbours by cells with the sites of their Voronoi diagrams are old (Clarkson, SIAM J. Comput. 1988). Looking up a robot's spheres in
+//! a structure laid out for vectors is from Ramsey, Kingston, Thomason, Kavraki: *Collision-Affording Point Trees* (RSS 2024), whose lists have
+//! the points within a maximum radius instead.
 
 use super::lanes::{Block, Isa, Lanes};
 
-/// Cells of a grid at the most, about, and for one point.
+/// Approximate maximum number of cells of a grid, and number of cells per point.
 const MOST_CELLS: f32 = 60_000.0;
 const CELLS_PER_POINT: f32 = 10.0;
 
-/// Cells of the smallest grid, about.
+/// Approximate number of cells of the smallest grid.
 const LEAST_CELLS: f32 = 5_000.0;
 
-/// The smallest cell, in metres.
+/// Minimum side of a cell, in metres.
 const LEAST_CELL_M: f32 = 0.004;
 
-/// Cells further away than where there are lists are looked at together, up to this part of their distance.
+/// Cells too far away for lists are handled in groups, whose size is at most this fraction of their distance.
 const COARSENESS: f32 = 0.3;
 
-/// Added to a whole number below 2^23, this leaves the number in the lowest bits.
+/// Added to a whole number below 2^23, this constant leaves the number in the lowest bits.
 const TO_BITS: f32 = 8_388_608.0;
 
-/// Adding and taking away this rounds to whole numbers.
+/// Adding and subtracting this constant rounds to whole numbers.
 const ROUND: f32 = 12_582_912.0;
 
-/// The list of a cell where every centre touches.
+/// The list of a cell in which every centre touches.
 const SOLID: [u32; 2] = [u32::MAX; 2];
 
-/// The place of a cell that is not filled in part.
+/// The start of a cell that has no small cells.
 const NOT_FILLED: u32 = u32::MAX;
 
-/// Sixteen points, or fewer and such as are infinitely far away.
+/// Sixteen points; unused ones are infinitely far away.
 type Points = [Block; 3];
 
-/// All of a block.
+/// The mask of a whole block.
 const WHOLE: u32 = 0xffff;
 
 const FAR: Points = [Block([f32::INFINITY; 16]); 3];
@@ -54,37 +54,37 @@ const FAR: Points = [Block([f32::INFINITY; 16]); 3];
 pub(crate) struct Cloud {
     /// Radius of the balls.
     pub(crate) radius: f32,
-    /// The box of all balls: its least sides, and its greatest with their signs changed.
+    /// The bounding box of all balls: its minimum, and its maximum with the sign changed.
     least: [f32; 3],
     minus_greatest: [f32; 3],
     layout: Layout,
-    /// Per cell, how far its centre is from the nearest point, or less.
+    /// Per cell, a lower bound of the distance of its centre from the nearest point.
     near: Vec<f32>,
-    /// Per cell, where its points are in `points`; nothing where no sphere is large enough.
+    /// Per cell, the range of its points in `points`; empty if no sphere is large enough to touch.
     lists: Vec<[u32; 2]>,
     points: Vec<Points>,
-    /// Spheres whose radius and that of the balls are together at most this are judged exactly.
+    /// The check is exact for spheres whose radius plus that of the balls is at most this.
     reach: f32,
     filling: Option<Filling>,
 }
 
-/// What is solid of cells that are so in part: each of them is cut into smaller ones, and of these it is known whether they are solid.
+/// Cells that are partly solid: each is divided into small cells that are solid or not.
 #[derive(Debug, Clone)]
 pub(crate) struct Filling {
-    /// How many small cells there are along a side of a cell.
+    /// Number of small cells along a side of a cell.
     pub(crate) per_side: usize,
-    /// Per cell, where its bits begin in `bits`, a whole number of words.
+    /// Per cell, the index of its first word in `bits`; each cell has whole words.
     starts: Vec<u32>,
     bits: Vec<u64>,
 }
 
 impl Filling {
-    /// Nothing is solid yet.
+    /// A filling in which nothing is solid.
     pub(crate) fn new(layout: &Layout, per_side: usize) -> Filling {
         Filling { per_side, starts: vec![NOT_FILLED; layout.cells()], bits: Vec::new() }
     }
 
-    /// Makes small cells of a column solid, from one to another along z.
+    /// Makes the small cells of a column solid, in a range along z.
     pub(crate) fn fill(&mut self, cell: usize, [x, y]: [usize; 2], z: std::ops::RangeInclusive<usize>) {
         if self.starts[cell] == NOT_FILLED {
             self.starts[cell] = self.bits.len() as u32;
@@ -96,7 +96,7 @@ impl Filling {
         }
     }
 
-    /// Whether the small cell that a centre is in is solid; `None` in a cell of which nothing is.
+    /// Whether the small cell of a centre is solid; `None` for a cell without small cells.
     #[inline]
     fn is_solid(&self, layout: &Layout, cell: usize, centre: [f32; 3]) -> Option<bool> {
         let start = self.starts[cell];
@@ -113,7 +113,7 @@ impl Filling {
     }
 }
 
-/// Where the cells are.
+/// The grid of cells.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Layout {
     pub(crate) least: [f32; 3],
@@ -123,7 +123,7 @@ pub(crate) struct Layout {
 }
 
 impl Layout {
-    /// Over a box that holds so many points, and `margin` around, in cells of a side of `least_cell` at least.
+    /// A grid over the bounding box of `points` points, with a `margin` around it and cells of at least `least_cell`.
     pub(crate) fn over(points: usize, least: [f32; 3], greatest: [f32; 3], margin: f32, least_cell: f32) -> Layout {
         let most = (points as f32 * CELLS_PER_POINT).clamp(LEAST_CELLS, MOST_CELLS);
         let extents: [f32; 3] = std::array::from_fn(|i| greatest[i] - least[i] + 2.0 * margin);
@@ -140,37 +140,37 @@ impl Layout {
         }
     }
 
-    /// The number of a cell.
+    /// The index of a cell.
     pub(crate) fn index(&self, [x, y, z]: [usize; 3]) -> usize {
         (x * self.counts[1] + y) * self.counts[2] + z
     }
 
-    /// Where the cell of a number is.
+    /// The position of a cell in the grid, by its index.
     pub(crate) fn slots(&self, index: usize) -> [usize; 3] {
         let [_, y, z] = self.counts;
         [index / (y * z), index / z % y, index % z]
     }
 
-    /// Where a coordinate is along an axis; at the end of the grid what is beside it.
+    /// The position of a coordinate along an axis; outside the grid that of its nearest cell.
     pub(crate) fn slot(&self, axis: usize, at: f32) -> usize {
         (((at - self.least[axis]) / self.cell).max(0.0) as usize).min(self.counts[axis] - 1)
     }
 
-    /// The centre of a cell.
+    /// The centre of a cell, by its index.
     pub(crate) fn centre(&self, index: usize) -> [f32; 3] {
         let at = self.slots(index);
         std::array::from_fn(|i| self.least[i] + (at[i] as f32 + 0.5) * self.cell)
     }
 
-    /// How many there are.
+    /// Number of cells.
     pub(crate) fn cells(&self) -> usize {
         self.counts.iter().product()
     }
 }
 
 impl Cloud {
-    /// A cloud of balls. Spheres whose radius and that of the balls are together at most `reach` are judged exactly; for larger ones it may find
-    /// a touch that is none. The layout's margin is `reach` at least.
+    /// A cloud of balls. The check is exact for spheres whose radius plus that of the balls is at most `reach`; for larger ones it may report a
+    /// contact that is none. The layout's margin must be at least `reach`.
     pub(crate) fn new(points: &[[f32; 3]], radius: f32, layout: Layout, reach: f32, isa: Isa) -> Cloud {
         let cells = layout.cells();
         let (near, lists) = (vec![f32::INFINITY; cells], vec![[0; 2]; cells]);
@@ -201,7 +201,7 @@ impl Cloud {
         self.hold(cell);
     }
 
-    /// Makes centres touch that are in small cells that are solid. A sphere that meets no ball is then wholly on one side of the surface.
+    /// Makes centres in solid small cells touch. A sphere that touches no ball is wholly on one side of the surface.
     pub(crate) fn fill_with(&mut self, filling: Filling) {
         for cell in (0..filling.starts.len()).filter(|cell| filling.starts[*cell] != NOT_FILLED) {
             self.near[cell] = f32::NEG_INFINITY;
@@ -210,7 +210,7 @@ impl Cloud {
         self.filling = Some(filling);
     }
 
-    /// Makes the box of all balls hold a cell.
+    /// Extends the bounding box of all balls by a cell.
     fn hold(&mut self, cell: usize) {
         let (centre, half) = (self.layout.centre(cell), self.layout.cell * 0.501);
         self.least = std::array::from_fn(|i| self.least[i].min(centre[i] - half));
@@ -222,7 +222,7 @@ impl Cloud {
         self.touching::<[f32; 8]>(centre.map(|c| [c; 8]), radius + self.radius, 1, true) != 0
     }
 
-    /// Whether a ball is about within a distance of a place, in metres.
+    /// Whether a ball is within about a distance of a place, in metres.
     pub(crate) fn is_within(&self, place: [f64; 3], reach: f64) -> bool {
         let beside = |i: usize| {
             let (least, greatest) = (f64::from(self.least[i]), -f64::from(self.minus_greatest[i]));
@@ -231,13 +231,13 @@ impl Cloud {
         (0..3).map(beside).sum::<f64>() <= reach * reach
     }
 
-    /// Whether spheres that are all in this box, the least sides with their signs changed, are beside the box of all balls.
+    /// Whether spheres that are all in this box (the minimum with its sign changed) are outside the bounding box of all balls.
     #[inline(always)]
     pub(super) fn is_beside(&self, bounds: &[f32; 6]) -> bool {
         (0..3).any(|i| bounds[i] < self.least[i] || bounds[3 + i] < self.minus_greatest[i])
     }
 
-    /// Which lanes' spheres may touch something; for all others it is certain that they do not.
+    /// The lanes whose spheres may touch something; for all others it is certain that they do not.
     #[inline(always)]
     pub(super) fn may_touch<V: Lanes>(&self, centre: [V; 3], radius: f32, lanes: u32, cells: &mut Block) -> u32 {
         let layout = &self.layout;
@@ -246,7 +246,7 @@ impl Cloud {
         let (mut off, mut out) = (V::splat(0.0), V::splat(0.0));
         let mut inside = centre;
         for i in 0..3 {
-            // The nearest place in the grid: all points are nearer to it than to a centre outside.
+            // The nearest place in the grid: it is nearer to all points than a centre outside.
             let (least, greatest) = (V::splat(layout.least[i]), V::splat(layout.greatest[i]));
             inside[i] = inside[i].max(least).min(greatest);
             let beyond = centre[i].sub(inside[i]);
@@ -270,7 +270,7 @@ impl Cloud {
         lanes & gap.mul_add(gap, out).below(V::splat(radius * radius))
     }
 
-    /// Which lanes' spheres touch a ball, or one of them where not all are asked for; `lanes` are looked at.
+    /// The lanes, among `lanes`, whose spheres touch a ball; one of them is enough unless `all` is set.
     #[inline(always)]
     pub(super) fn touching<V: Lanes>(&self, centre: [V; 3], radius: f32, lanes: u32, all: bool) -> u32 {
         let mut cells = Block([0.0; 16]);
@@ -302,11 +302,11 @@ impl Cloud {
         let [first, end] = self.lists[cell];
         let is_filled = || self.filling.as_ref().and_then(|filling| filling.is_solid(&self.layout, cell, centre));
         if radius > self.reach && (first == end || self.is_off_the_grid(&centre)) {
-            // Larger than was announced: the lists are of centres in the grid, and of places less far from all points.
+            // The sphere is larger than `reach`: lists cover only centres in the grid, and only places up to a distance from all points.
             return true;
         }
         if first == end {
-            // Solid, in whole or in part.
+            // The cell is solid, wholly or in part.
             return is_filled().unwrap_or(true);
         }
         let reach = V::splat(radius * radius);
@@ -325,13 +325,13 @@ impl Cloud {
     }
 }
 
-/// The cell whose number was added to `TO_BITS`.
+/// The cell index that was added to `TO_BITS`.
 #[inline(always)]
 fn slot_of(number: f32) -> usize {
     (number.to_bits() & 0x7f_ffff) as usize
 }
 
-/// Squared distances of points from a place; `part` is which of the points where they are more than there are lanes.
+/// Squared distances of points from a place; `part` selects which of the sixteen points if there are fewer lanes.
 #[inline(always)]
 fn squares<V: Lanes>(points: &Points, from: &[f32; 3], part: usize) -> V {
     let mut sum = V::splat(0.0);
@@ -342,23 +342,23 @@ fn squares<V: Lanes>(points: &Points, from: &[f32; 3], part: usize) -> V {
     sum
 }
 
-/// A part of a grid: from these cells up to those.
+/// A part of a grid: a range of cells along each axis.
 #[derive(Clone, Copy)]
 struct Cells {
     from: [usize; 3],
     to: [usize; 3],
 }
 
-/// Fills in the cells of a cloud.
+/// Computes the cells of a cloud.
 #[inline(always)]
 pub(super) fn fill<V: Lanes>(cloud: &mut Cloud, points: &[Points], reach: f32) {
     let whole = Cells { from: [0; 3], to: cloud.layout.counts };
-    // A list per depth, used again and again.
+    // One list per depth, used again and again.
     let mut rooms: Vec<Vec<Points>> = vec![Vec::new(); 3 * usize::BITS as usize];
     let mut todo: Vec<(Cells, usize)> = vec![(whole, 0)];
     rooms[0] = points.to_vec();
     while let Some((part, depth)) = todo.pop() {
-        // Depth first: the list of a depth is that of the part that was cut last.
+        // Depth first: the list of a depth is that of the part that was bisected last.
         let (above, below) = rooms.split_at_mut(depth + 1);
         let (parent, room) = (&above[depth], &mut below[0]);
         let layout = cloud.layout;
@@ -395,7 +395,7 @@ pub(super) fn fill<V: Lanes>(cloud: &mut Cloud, points: &[Points], reach: f32) {
     }
 }
 
-/// Where no sphere reaches that has lists, a bound is enough.
+/// A lower bound of the distance is enough for cells that no sphere with lists reaches.
 fn fill_far(cloud: &mut Cloud, part: Cells, middle: &[f32; 3], distance: f32) {
     let layout = cloud.layout;
     let along = |i: usize, slot: usize| layout.least[i] + (slot as f32 + 0.5) * layout.cell - middle[i];
@@ -410,7 +410,7 @@ fn fill_far(cloud: &mut Cloud, part: Cells, middle: &[f32; 3], distance: f32) {
     }
 }
 
-/// The point nearest to a place, and how far it is.
+/// The nearest point to a place, and its distance.
 #[inline(always)]
 fn nearest<V: Lanes>(points: &[Points], to: &[f32; 3]) -> ([f32; 3], f32) {
     let mut least = V::splat(f32::INFINITY);
@@ -434,7 +434,7 @@ fn nearest<V: Lanes>(points: &[Points], to: &[f32; 3]) -> ([f32; 3], f32) {
     (at, best.sqrt())
 }
 
-/// Which points of a block are not kept from a box by `nearest`, a bit for each.
+/// The mask of the points of a block that may be nearer than `nearest` to some place in a box.
 #[inline(always)]
 fn stays<V: Lanes>(block: &Points, middle: &[f32; 3], nearest: &[f32; 3], size: [f32; 3], best: f32) -> u32 {
     let mut stays = 0;
@@ -444,19 +444,19 @@ fn stays<V: Lanes>(block: &Points, middle: &[f32; 3], nearest: &[f32; 3], size: 
             let aside = V::load_part(&block[i], part).sub(V::splat(nearest[i])).abs();
             room = aside.mul_add(V::splat(size[i]), room);
         }
-        // Infinitely far ones are not below; the nearest itself is kept by the rounding.
+        // Infinitely far points are not below; rounding up keeps the nearest point itself.
         let room = room.mul(V::splat(1.0 + 1e-6)).add(V::splat(1e-9));
         stays |= squares::<V>(block, middle, part).below(room) << (part * V::WIDTH);
     }
     stays
 }
 
-/// The square of how far two places are from each other.
+/// The squared distance of two places.
 fn square(a: &[f32; 3], b: &[f32; 3]) -> f32 {
     (0..3).map(|i| (a[i] - b[i]).powi(2)).sum()
 }
 
-/// Appends the points that `nearest` does not keep from a box, in whole blocks.
+/// Appends the points that may be nearer than `nearest` to some place in a box, in whole blocks.
 #[inline(always)]
 fn keep<V: Lanes>(points: &[Points], middle: &[f32; 3], nearest: &[f32; 3], size: [f32; 3], kept: &mut Vec<Points>) {
     let best = square(nearest, middle);
@@ -487,7 +487,8 @@ fn keep<V: Lanes>(points: &[Points], middle: &[f32; 3], nearest: &[f32; 3], size
     }
 }
 
-/// Leaves only the points that `nearest` does not keep from a box. What stays where it is, which is most at last, is not copied.
+/// Keeps only the points that may be nearer than `nearest` to some place in a box. Points that stay in their place, most in the end, are not
+/// copied.
 #[inline(always)]
 fn retain<V: Lanes>(points: &mut Vec<Points>, middle: &[f32; 3], nearest: &[f32; 3], size: [f32; 3]) {
     let best = square(nearest, middle);
@@ -514,10 +515,10 @@ fn retain<V: Lanes>(points: &mut Vec<Points>, middle: &[f32; 3], nearest: &[f32;
     }
 }
 
-/// Leaves only the points that those nearest to the corners do not keep from a box either.
+/// Drops the points that are nowhere in a box nearer than the points nearest to its corners.
 #[inline(always)]
 fn thin<V: Lanes>(points: &mut Vec<Points>, middle: &[f32; 3], size: [f32; 3]) {
-    // Opposite corners follow each other.
+    // In this order opposite corners follow each other.
     for corner in [0, 7, 1, 6, 2, 5, 3, 4] {
         if points.len() <= 1 {
             return;

@@ -1,10 +1,11 @@
-//! Where postures along an edge touch something, for as many postures at once as there are lanes: kinematics, and one walk over all that may
-//! touch, whose [`Visitor`] says what becomes of that. [`sweep`](super::sweep) has the motions that are checked so.
+//! Collision check of the postures along an edge, for as many postures at once as there are lanes: kinematics, and one walk over all possible
+//! contacts, whose [`Visitor`] handles what it finds. [`sweep`](super::sweep) has the motions that are checked so.
 //!
-//! The walk (Thomason, Kingston, Kavraki: *Motions in Microseconds via Vectorized Sampling-Based Planning*, ICRA 2024): for all links that are fixed to one frame together, the hand before the shoulder, the box that holds their
-//! bounding sphere in all lanes against those of the obstacles that it can reach at all, as many at once as there are lanes; the sphere
-//! against what is in there, nearest to the shoulder first; then the bounding sphere of each link and its fine spheres, only against
-//! obstacles that the larger sphere meets. Then clouds of points and pairs, in the same manner. [`walk_among`] does the same for what was noted before.
+//! The walk (Thomason, Kingston, Kavraki: *Motions in Microseconds via Vectorized Sampling-Based Planning*, ICRA 2024) goes through the rigid
+//! parts, the hand before the shoulder; a rigid part is all links fixed to one frame. The box that holds its bounding sphere in all lanes is
+//! compared with the boxes of the obstacles within its reach, as many at once as there are lanes; then the sphere with the obstacles found,
+//! nearest to the shoulder first; then the bounding sphere of each link and its fine spheres, only with obstacles that the larger sphere touches.
+//! Clouds of points and pairs follow, in the same manner. [`walk_among`] does the same for what was noted before.
 //!
 //! There are no closures over vectors here: a closure that is not inlined is compiled without the instructions of its caller.
 
@@ -14,21 +15,21 @@ use super::sweep::{Growth, Near, Spans};
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Joints of a configuration at the most; unused ones are zero.
+/// Maximum number of joints of a configuration; unused ones are zero.
 pub(crate) const LENGTH: usize = 16;
 
-/// A joint's frame: the parent's, moved by a constant, then turned about or moved along its z axis.
+/// A joint's frame: the parent's, moved by a constant, then rotated about or translated along its z axis.
 #[derive(Debug, Clone)]
 pub(crate) struct Frame {
     pub(crate) parent: usize,
     /// Rows of the rotation, then the translation.
     pub(crate) origin: [f32; 12],
-    /// The joint that moves it, and whether it slides.
+    /// The joint that moves it, and whether the joint is prismatic.
     pub(crate) joint: usize,
     pub(crate) slides: bool,
-    /// How far it moves for one radian (or metre) of the joint.
+    /// Motion of the frame for one radian (or metre) of the joint.
     pub(crate) factor: f32,
-    /// How far it slides at most.
+    /// Maximum translation by a prismatic joint.
     pub(crate) travel: f32,
 }
 
@@ -37,10 +38,10 @@ pub(crate) struct Frame {
 pub(crate) struct Group {
     /// Frame 0 is the world.
     pub(crate) frame: usize,
-    /// Centre and radius of a sphere that holds all others.
+    /// Centre and radius of the bounding sphere.
     pub(crate) coarse: [f32; 4],
     pub(crate) fine: Vec<[f32; 4]>,
-    /// Where its fine centres are in the scratch blocks.
+    /// The index of its fine centres in the scratch blocks.
     pub(crate) slot: usize,
 }
 
@@ -48,27 +49,27 @@ pub(crate) struct Group {
 #[derive(Debug, Clone)]
 pub(crate) struct Rigid {
     pub(crate) frame: usize,
-    /// Centre and radius of a sphere that holds all of them.
+    /// Centre and radius of the bounding sphere of all groups.
     pub(crate) coarse: [f32; 4],
     pub(crate) groups: Range<usize>,
-    /// What it can reach, nearest to its anchor first.
+    /// The obstacles that it can reach, the nearest to its anchor first.
     pub(crate) near: Vec<Row>,
     /// Indices of the clouds that it can reach.
     pub(crate) clouds: Vec<u32>,
 }
 
-/// As many obstacles as there are lanes, and the boxes along the axes of the world that hold them.
+/// As many obstacles as there are lanes, with their axis-aligned boxes in the world.
 #[derive(Debug, Clone)]
 pub(crate) struct Row {
     /// Indices of the obstacles.
     pub(crate) obstacles: Vec<u32>,
-    /// Least x, y, z; unused lanes hold infinity.
+    /// Minimum x, y, z; unused lanes hold infinity.
     pub(crate) least: [Block; 3],
-    /// Greatest x, y, z, with the sign changed.
+    /// Maximum x, y, z, with the sign changed.
     pub(crate) minus_greatest: [Block; 3],
 }
 
-/// Two rigid parts of which groups must not meet: which.
+/// Two rigid parts with the pairs of their groups that must not touch.
 #[derive(Debug, Clone)]
 pub(crate) struct SelfPair {
     pub(crate) first: u32,
@@ -82,16 +83,16 @@ pub(crate) struct Obstacle {
     pub(crate) centre: [f32; 3],
     /// Its axes in the world, one per row.
     pub(crate) axes: [f32; 9],
-    /// Half extents; for a cylinder radius, radius, half length.
+    /// Half extents; for a cylinder its radius, radius and half length.
     pub(crate) half: [f32; 3],
-    /// How far it is rounded outwards.
+    /// The radius by which it is rounded outwards.
     pub(crate) round: f32,
     pub(crate) is_cylinder: bool,
-    /// Whether its z axis is the world's.
+    /// Whether its z axis is that of the world.
     pub(crate) upright: bool,
 }
 
-/// A robot among obstacles, as the kernel reads it.
+/// A robot among obstacles, compiled for the kernel.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Compiled {
     pub(crate) joints: usize,
@@ -105,11 +106,11 @@ pub(crate) struct Compiled {
     pub(crate) obstacles: Vec<Obstacle>,
     pub(crate) clouds: Vec<Arc<Cloud>>,
     pub(crate) slots: usize,
-    /// How its rigid parts, then its groups, move.
+    /// How its rigid parts, and after them its groups, move with the joints.
     pub(crate) spans: Spans,
 }
 
-/// What the spheres of a group may touch, by its index.
+/// What the spheres of a group touch, by its index.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Other {
     Obstacle(u32),
@@ -122,15 +123,15 @@ pub(super) enum Other {
 pub(super) struct Contact {
     pub(super) group: u32,
     pub(super) other: Other,
-    /// Which of the fine spheres of the group, and which of the other group's.
+    /// Indices of the fine sphere of the group, and of the other group's.
     spheres: (u32, u32),
 }
 
-/// What is done with what a walk finds.
+/// Handles what a walk finds.
 pub(super) trait Visitor {
-    /// Whether it asks for all lanes in which a group touches something, and not for one of them.
+    /// Whether it needs all lanes in which a group touches something, or only one.
     const ALL: bool;
-    /// A sphere touches something in these lanes. Whether the walk goes on.
+    /// Called when a sphere touches something in these lanes. Returns whether the walk goes on.
     fn touch(&mut self, contact: Contact, lanes: u32) -> bool;
 }
 
@@ -148,31 +149,31 @@ impl Visitor for First {
     }
 }
 
-/// Lists of what is near, one for each level of a swept check.
+/// Number of lists of near things, one for each level of a swept check.
 pub(crate) const DEPTH: usize = 4;
 
-/// Contacts that are remembered: what was in the way of a motion is often in the way of the next one, too. How many of them a motion is first
-/// looked at beside: what they cost is in vain for motions that are free.
+/// Number of contacts that are remembered, because what blocked one motion often blocks the next; and how many of them are checked before each
+/// motion: for free motions that time is lost.
 const CONTACTS: usize = 32;
 const LATEST: usize = 8;
 
-/// Room for one batch.
+/// Working memory of one batch.
 #[derive(Debug, Clone)]
 pub(crate) struct Scratch {
-    /// What was touched last, the latest first.
+    /// The last contacts, the latest first.
     contacts: Vec<Contact>,
     frames: Vec<[Block; 12]>,
-    /// Of each rigid part, how much larger its spheres are in this batch, too.
+    /// Centres of each rigid part, and by how much its spheres are enlarged in this batch.
     rigid: Vec<([Block; 3], f32)>,
-    /// As that, of each group.
+    /// The same for each group.
     coarse: Vec<([Block; 3], f32)>,
     fine: Vec<[Block; 3]>,
-    /// Batches in which a group's coarse and fine centres were computed last.
+    /// The batches in which a group's coarse and fine centres were last computed.
     coarse_stamps: Vec<u64>,
     fine_stamps: Vec<u64>,
     batch: u64,
     pub(super) growth: Growth,
-    /// What is near: in each list, of a stretch within that of the list before.
+    /// Near things: each list is for a stretch within the stretch of the list before.
     pub(super) near: [Vec<Near>; DEPTH],
 }
 
@@ -197,7 +198,7 @@ impl Scratch {
         }
     }
 
-    /// Puts what ended a walk before all other contacts.
+    /// Puts the contact that ended a walk first in the list.
     pub(super) fn remember(&mut self, First(found): First) {
         let Some(contact) = found.filter(|contact| !matches!(contact.other, Other::Cloud(_))) else { return };
         let last = self.contacts.iter().position(|known| *known == contact).unwrap_or_else(|| {
@@ -216,28 +217,28 @@ impl Scratch {
 pub(crate) struct Edge<'a> {
     pub(crate) compiled: &'a Compiled,
     pub(crate) start: &'a [f32; LENGTH],
-    /// From the start to the end.
+    /// Difference of the end and the start.
     pub(crate) delta: &'a [f32; LENGTH],
-    /// How many batches; the end is checked, the start is not.
+    /// Number of batches; the end is checked, the start is not.
     pub(crate) batches: usize,
-    /// What is looked at.
+    /// What is checked.
     pub(crate) among: Among,
 }
 
-/// Everything (depth 0), or what the list before this depth has as near in one of these lanes.
+/// Everything (depth 0), or what the list of the depth before has in one of these lanes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Among {
     pub(crate) depth: usize,
     pub(crate) lanes: u32,
 }
 
-/// Where the joints are in the postures of a batch.
+/// The joint positions of the postures of a batch.
 trait Postures<V> {
-    /// So many times the position of a joint.
+    /// The position of a joint times a factor.
     fn position(&self, joint: usize, factor: f32) -> V;
 }
 
-/// Postures along an edge, a lane for each, by how far along it they are.
+/// Postures along an edge, one per lane, by their fractions of the edge.
 struct Along<'a, V> {
     edge: &'a Edge<'a>,
     at: V,
@@ -251,7 +252,7 @@ impl<V: Lanes> Postures<V> for Along<'_, V> {
     }
 }
 
-/// A part of sixteen postures that have nothing to do with each other: a block per joint.
+/// Some of sixteen independent postures: one block per joint.
 struct Each<'a> {
     positions: &'a [Block],
     part: usize,
@@ -264,8 +265,8 @@ impl<V: Lanes> Postures<V> for Each<'_> {
     }
 }
 
-/// Places the robot's frames in the postures of a batch. Those of one batch are spread over the whole edge, later batches fill the gaps, so
-/// that the first most likely finds what is in the way.
+/// Computes the robot's frames in the postures of a batch. The postures of one batch are spread over the whole edge and later batches fill the
+/// gaps, so that the first batch most likely finds a collision.
 #[inline(always)]
 pub(super) fn pose<V: Lanes>(edge: &Edge<'_>, batch: usize, scratch: &mut Scratch) {
     let mut fractions = Block([0.0; 16]);
@@ -277,19 +278,19 @@ pub(super) fn pose<V: Lanes>(edge: &Edge<'_>, batch: usize, scratch: &mut Scratc
     kinematics(edge.compiled, &Along { edge, at }, scratch);
 }
 
-/// Places the robot's frames in a part of sixteen postures, as many as there are lanes; of each joint a block.
+/// Computes the robot's frames in a part of sixteen postures, as many as there are lanes; one block per joint.
 #[inline(always)]
 pub(super) fn pose_each<V: Lanes>(compiled: &Compiled, positions: &[Block], part: usize, scratch: &mut Scratch) {
     kinematics::<V>(compiled, &Each { positions, part }, scratch);
 }
 
-/// Shows a visitor all contacts in the postures of the batch, and says whether it went on to the end.
+/// Shows a visitor all contacts in the postures of the batch; returns whether it went on to the end.
 #[inline(always)]
 pub(super) fn walk<V: Lanes, F: Visitor>(compiled: &Compiled, scratch: &mut Scratch, visitor: &mut F) -> bool {
     in_obstacles::<V, F>(compiled, scratch, visitor) && in_itself::<V, F>(compiled, scratch, visitor)
 }
 
-/// As [`walk`], where only what was near in some of these lanes is looked at.
+/// As [`walk`], but checks only what was near in some of these lanes.
 #[inline(always)]
 pub(super) fn walk_among<V: Lanes, F: Visitor>(
     compiled: &Compiled,
@@ -311,7 +312,7 @@ pub(super) fn walk_among<V: Lanes, F: Visitor>(
     true
 }
 
-/// Whether one of the contacts remembered last is there again. It decides nothing that the whole check would not find.
+/// Whether one of the latest remembered contacts occurs again. The whole check would find it, too.
 #[inline(always)]
 pub(super) fn touches_again<V: Lanes>(compiled: &Compiled, scratch: &mut Scratch) -> bool {
     for i in 0..scratch.contacts.len().min(LATEST) {
@@ -323,7 +324,7 @@ pub(super) fn touches_again<V: Lanes>(compiled: &Compiled, scratch: &mut Scratch
     false
 }
 
-/// In which of these lanes one of all remembered contacts is there again.
+/// The lanes, among `lanes`, in which any remembered contact occurs again.
 #[inline(always)]
 pub(super) fn all_touching_again<V: Lanes>(compiled: &Compiled, lanes: u32, scratch: &mut Scratch) -> u32 {
     let mut left = lanes;
@@ -340,7 +341,7 @@ pub(super) fn all_touching_again<V: Lanes>(compiled: &Compiled, lanes: u32, scra
     lanes & !left
 }
 
-/// In which lanes a remembered contact is there again.
+/// The lanes in which a remembered contact occurs again.
 #[inline(always)]
 fn touching_again<V: Lanes>(compiled: &Compiled, contact: Contact, scratch: &Scratch) -> u32 {
     let Contact { group, other, spheres } = contact;
@@ -351,7 +352,7 @@ fn touching_again<V: Lanes>(compiled: &Compiled, contact: Contact, scratch: &Scr
             let (other, more) = fine_sphere::<V>(compiled, (other, spheres.1), scratch);
             meet(at, other, radius + more)
         }
-        // None is remembered.
+        // Contacts with clouds are not remembered.
         Other::Cloud(_) => 0,
     }
 }
@@ -363,11 +364,11 @@ fn fine_sphere<V: Lanes>(compiled: &Compiled, (group, which): (u32, u32), scratc
     (place(&scratch.frames[group.frame], sphere), sphere[3])
 }
 
-/// Sine and cosine: reduced to half a turn, the polynomials of least greatest error for the half angle (5e-9 and 5e-8), doubled. The
-/// results are off by less than 1e-6, rounding included.
+/// Sine and cosine: reduced to half a turn, minimax polynomials for the half angle (errors 5e-9 and 5e-8), doubled. The error of the results is
+/// less than 1e-6, rounding included.
 #[inline(always)]
 fn sin_cos<V: Lanes>(x: V) -> (V, V) {
-    // Adding and taking away this rounds to whole numbers.
+    // Adding and subtracting this constant rounds to whole numbers.
     const ROUND: f32 = 12_582_912.0;
     let turns = x.mul_add(V::splat(std::f32::consts::FRAC_1_PI * 0.5), V::splat(ROUND)).sub(V::splat(ROUND));
     let x = turns.mul_add(V::splat(-6.281_25), x);
@@ -474,7 +475,7 @@ fn fetch<V: Lanes>(from: &[Block; 3]) -> [V; 3] {
     [V::load(&from[0]), V::load(&from[1]), V::load(&from[2])]
 }
 
-/// Fills in the centre of a group's bounding sphere, once per batch.
+/// Computes the centre of a group's bounding sphere, once per batch.
 #[inline(always)]
 fn approach<V: Lanes>(compiled: &Compiled, index: usize, scratch: &mut Scratch) {
     if scratch.coarse_stamps[index] != scratch.batch {
@@ -486,7 +487,7 @@ fn approach<V: Lanes>(compiled: &Compiled, index: usize, scratch: &mut Scratch) 
     }
 }
 
-/// Fills in the fine centres of a group, once per batch.
+/// Computes the fine centres of a group, once per batch.
 #[inline(always)]
 fn refine<V: Lanes>(group: &Group, index: usize, scratch: &mut Scratch) {
     if scratch.fine_stamps[index] != scratch.batch {
@@ -547,7 +548,7 @@ fn in_obstacles<V: Lanes, F: Visitor>(compiled: &Compiled, scratch: &mut Scratch
     true
 }
 
-/// Where a group meets an obstacle; `about` says where its bounding sphere does, if that is known, and else all lanes.
+/// The contacts of a group with an obstacle; `about` has the lanes of its bounding sphere's contacts, if known, or else all lanes.
 #[inline(always)]
 fn group_in_obstacle<V: Lanes, F: Visitor>(
     compiled: &Compiled,
@@ -588,7 +589,7 @@ fn group_in_obstacle<V: Lanes, F: Visitor>(
     true
 }
 
-/// Where a group touches a cloud, in some lanes.
+/// The contacts of a group with a cloud, in some lanes.
 #[inline(always)]
 fn group_in_cloud<V: Lanes, F: Visitor>(
     compiled: &Compiled,
@@ -626,7 +627,7 @@ fn group_in_cloud<V: Lanes, F: Visitor>(
     true
 }
 
-/// Greatest and least coordinates of spheres in all lanes, the least with the sign changed.
+/// Maximum and minimum coordinates of spheres in all lanes, the minimum with its sign changed.
 #[inline(always)]
 fn bounds<V: Lanes>([x, y, z]: [V; 3], radius: f32) -> [f32; 6] {
     let zero = V::splat(0.0);
@@ -634,7 +635,7 @@ fn bounds<V: Lanes>([x, y, z]: [V; 3], radius: f32) -> [f32; 6] {
     std::array::from_fn(|i| peaks[i] + radius)
 }
 
-/// Which obstacles of a row are about there, a bit each.
+/// The mask of the obstacles of a row whose boxes overlap the bounds.
 #[inline(always)]
 fn overlaps<V: Lanes>(bounds: &[f32; 6], row: &Row) -> u32 {
     let mut hits = V::ALL;
@@ -702,7 +703,7 @@ fn meet<V: Lanes>(a: [V; 3], b: [V; 3], reach: f32) -> u32 {
     squared(minus(a, b)).below(V::splat(reach * reach))
 }
 
-/// Where links touch each other; the places of the rigid parts are known.
+/// The contacts of links with each other; the centres of the rigid parts are known.
 #[inline(always)]
 fn in_itself<V: Lanes, F: Visitor>(compiled: &Compiled, scratch: &mut Scratch, visitor: &mut F) -> bool {
     for pair in &compiled.pairs {
@@ -722,7 +723,7 @@ fn in_itself<V: Lanes, F: Visitor>(compiled: &Compiled, scratch: &mut Scratch, v
     true
 }
 
-/// Where two groups touch.
+/// The contacts of two groups.
 #[inline(always)]
 fn groups_meet<V: Lanes, F: Visitor>(
     compiled: &Compiled,
@@ -735,7 +736,7 @@ fn groups_meet<V: Lanes, F: Visitor>(
     let (a, b) = (&compiled.groups[i], &compiled.groups[j]);
     let more = scratch.coarse[i].1 + scratch.coarse[j].1;
     let (at_a, at_b) = (fetch::<V>(&scratch.coarse[i].0), fetch::<V>(&scratch.coarse[j].0));
-    // Where their bounding spheres meet and no others were found to.
+    // The lanes in which their bounding spheres touch and no contact has been found yet.
     let mut left = meet(at_a, at_b, a.coarse[3] + b.coarse[3] + more);
     if left == 0 {
         return true;

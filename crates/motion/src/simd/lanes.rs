@@ -1,9 +1,8 @@
-//! Several `f32` side by side, and which instructions this processor has for them.
+//! Vectors of several `f32`, and the instruction sets of this processor for them.
 //!
-//! The only file of the crate with unsafe code, for two reasons: the vector intrinsics of `core::arch` may be called only where
-//! the processor has them, which [`Isa::detect`] establishes once and nothing else can make an [`Isa`]; and loads and stores
-//! take pointers, here always to a whole [`Block`]. The kernels themselves are safe, generic over [`Lanes`] and inlined into one
-//! function per instruction set.
+//! The only file of the crate with unsafe code, for two reasons: the vector intrinsics of `core::arch` may be called only where the processor has
+//! them, which [`Isa::detect`] establishes once, and nothing else can make an [`Isa`]; and loads and stores take pointers, here always to a whole
+//! [`Block`]. The kernels themselves are safe, generic over [`Lanes`] and inlined into one function per instruction set.
 
 #![allow(unsafe_code, reason = "vector intrinsics behind a detected instruction set, see above")]
 
@@ -16,7 +15,7 @@ use super::{nearest, sweep};
 #[repr(C, align(64))]
 pub(crate) struct Block(pub(crate) [f32; 16]);
 
-/// Numbers side by side. Masks have one bit per lane.
+/// A vector of numbers. Masks have one bit per lane.
 pub(super) trait Lanes: Copy {
     const WIDTH: usize;
     /// The mask with a bit for every lane.
@@ -29,15 +28,15 @@ pub(super) trait Lanes: Copy {
     fn add(self, other: Self) -> Self;
     fn sub(self, other: Self) -> Self;
     fn mul(self, other: Self) -> Self;
-    /// `self * factor + term`, rounded once where the processor does.
+    /// `self * factor + term`, rounded once if the processor has the instruction.
     fn mul_add(self, factor: Self, term: Self) -> Self;
     fn max(self, other: Self) -> Self;
     fn min(self, other: Self) -> Self;
     fn sqrt(self) -> Self;
     fn below(self, other: Self) -> u32;
-    /// The greatest lane.
+    /// The maximum of all lanes.
     fn peak(self) -> f32;
-    /// The greatest lanes of six, the first six of these numbers.
+    /// The maxima of six vectors, in the first six of these numbers.
     #[inline(always)]
     fn peaks(six: [Self; 6]) -> [f32; 8] {
         let [a, b, c, d, e, f] = six;
@@ -51,7 +50,7 @@ pub(super) trait Lanes: Copy {
     }
 }
 
-/// Instructions that this processor was found to have.
+/// An instruction set that this processor was found to have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Isa(Kind);
 
@@ -67,12 +66,12 @@ enum Kind {
 }
 
 impl Isa {
-    /// The widest of this processor.
+    /// The widest instruction set of this processor.
     pub fn detect() -> Isa {
         Isa::available()[0]
     }
 
-    /// All of this processor, the widest first; the last is the plain one.
+    /// All instruction sets of this processor, the widest first; the last one is the scalar one.
     pub fn available() -> Vec<Isa> {
         let mut all = Vec::new();
         #[cfg(target_arch = "x86_64")]
@@ -92,7 +91,7 @@ impl Isa {
         all
     }
 
-    /// How many configurations are checked at once.
+    /// Number of configurations that are checked at once.
     pub fn width(self) -> usize {
         match self.0 {
             #[cfg(target_arch = "x86_64")]
@@ -464,7 +463,7 @@ mod x86 {
         }
     }
 
-    /// The greater ones of both halves.
+    /// The lane-wise maximum of both halves.
     #[inline(always)]
     unsafe fn halved(a: __m512) -> __m256 {
         unsafe {
@@ -473,7 +472,7 @@ mod x86 {
         }
     }
 
-    /// The greatest lanes of six vectors: half of the instructions of six by themselves, as two, then four of them are halved at once.
+    /// The maxima of six vectors with half of the instructions of six separate ones: two, then four of them are halved at once.
     #[inline(always)]
     unsafe fn peaks([a, b, c, d, e, f]: [__m256; 6]) -> [f32; 8] {
         unsafe {
@@ -658,7 +657,7 @@ mod tests {
     use super::*;
 
     fn peaks<V: Lanes>() -> [f32; 8] {
-        // The greatest number of each is in another lane.
+        // The maximum of each vector is in another lane.
         let mut six = [V::splat(0.0); 6];
         for (i, vector) in six.iter_mut().enumerate() {
             let mut block = Block([-10.0; 16]);

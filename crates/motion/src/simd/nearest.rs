@@ -1,17 +1,17 @@
-//! The nearest of many configurations: a linear scan over blocks of sixteen, one array per joint. Trees have tens to thousands
-//! of nodes here, where a scan beats every index.
+//! Nearest neighbour of a configuration: a linear scan over blocks of sixteen nodes, one array per joint. Trees have tens to thousands of nodes
+//! here, for which a scan is faster than every index.
 //!
-//! What is compared is half of the squared length of a node less its inner product with the goal: half of the squared distance, but for what is the
-//! same for all nodes. That is one instruction per joint and block.
+//! Nodes are compared by half of their squared length minus their inner product with the goal: half of the squared distance without the term that
+//! is the same for all nodes. That takes one instruction per joint and block.
 
 use super::lanes::{Block, Lanes};
 
-/// Chains of sums that are worked on side by side: each instruction waits for the one before it in its chain, and a coordinate of the goal is
-/// fetched once for all of them.
+/// Number of sums that are computed side by side, because each instruction waits for the one before it in its sum, and a coordinate of the goal is
+/// loaded once for all of them.
 const CHAINS: usize = 4;
 
-/// The index of the nearest of some nodes; node `i` is lane `i % 16` of the `dimensions + 1` blocks from `i / 16 * (dimensions + 1)` on, of
-/// which the last has half of the squared lengths. Unused lanes hold infinity there. The first of equals wins.
+/// The index of the nearest node. Node `i` is lane `i % 16` of the `dimensions + 1` blocks from `i / 16 * (dimensions + 1)` on; the last of these
+/// has half of the squared lengths, and infinity in unused lanes. Among equals the first wins.
 #[inline(always)]
 pub(super) fn nearest<V: Lanes>(blocks: &[Block], dimensions: usize, to: &[f32; 16]) -> usize {
     let parts = 16 / V::WIDTH;
@@ -34,8 +34,8 @@ pub(super) fn nearest<V: Lanes>(blocks: &[Block], dimensions: usize, to: &[f32; 
     best.first()
 }
 
-/// As [`nearest`], for sixteen goals at once, of each joint a block. Here the nodes come one after the other: `states` has them, `blocks` only half of
-/// their squared lengths.
+/// As [`nearest`], for sixteen goals at once, given as one block per joint. Here the nodes are stored one after the other in `states`; `blocks`
+/// has only half of their squared lengths.
 #[inline(always)]
 pub(super) fn nearest_each<V: Lanes>(blocks: &[Block], states: &[[f32; 16]], to: &[Block], found: &mut [u32; 16]) {
     let size = to.len() + 1;
@@ -60,14 +60,14 @@ pub(super) fn nearest_each<V: Lanes>(blocks: &[Block], states: &[[f32; 16]], to:
     }
 }
 
-/// Of each lane of each chain, the least sum and the row that it is in, which is a whole number.
+/// Per lane of each chain, the minimum sum and its row, which is a whole number.
 struct Best<V> {
     sums: [V; CHAINS],
     rows: [V; CHAINS],
 }
 
 impl<V: Lanes> Best<V> {
-    /// Looks at as many chains of nodes, the first of them in this row.
+    /// Adds some chains of nodes, the first of them in row `row`.
     #[inline(always)]
     fn look<const COUNT: usize>(&mut self, chunk: &[Block], dimensions: usize, to: &[f32; 16], row: usize) {
         let parts = 16 / V::WIDTH;
@@ -90,7 +90,7 @@ impl<V: Lanes> Best<V> {
         }
     }
 
-    /// The first node of those with the least sum.
+    /// The first node with the minimum sum.
     #[inline(always)]
     fn first(&self) -> usize {
         let parts = 16 / V::WIDTH;
@@ -127,7 +127,7 @@ mod tests {
     fn the_nearest_node_is_found_in_trees_of_all_sizes_and_the_first_of_equals() {
         let mut random = ChaCha8Rng::seed_from_u64(1);
         for dimensions in [1, 6, 7, 8, 15, 16] {
-            // Whole numbers, few for each joint: sums without rounding, and many equals.
+            // Whole numbers, few for each joint: sums without rounding errors, and many equal ones.
             let mut posture = || -> [f32; 16] {
                 std::array::from_fn(|j| if j < dimensions { random.random_range(-2..=2) as f32 } else { 0.0 })
             };
@@ -150,7 +150,7 @@ mod tests {
                 let first = nodes.iter().position(|node| square(node) == least);
                 for isa in Isa::available() {
                     assert_eq!(Some(isa.nearest(&blocks, dimensions, &to)), first, "{isa:?} {dimensions} {count}");
-                    // All others are where the first node is.
+                    // All other goals are at the first node.
                     let goal = |lane, j| if lane == count % 16 { to[j] } else { nodes[0][j] };
                     let goals: Vec<Block> =
                         (0..dimensions).map(|j| Block(std::array::from_fn(|lane| goal(lane, j)))).collect();

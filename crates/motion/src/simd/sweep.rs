@@ -1,27 +1,27 @@
-//! Straight motions, looked at in postures ([`is_free`]) or in the whole stretches between these ([`near`]).
+//! Collision check of straight motions, in postures ([`is_free`]) or in whole stretches between them ([`near`]).
 //!
-//! A stretch is looked at again only beside what was near it. Its spheres are grown by how far they can move within it, and a walk notes what
-//! they touch then; what they do not touch is out of reach of every posture of the stretch. So a finer look at it, be it by shorter stretches or by
-//! postures, needs the noted alone ([`Among`]), and where nothing was noted the stretch is free. The answer is that of a look at
-//! everything: a sphere that touches in a posture has a grown one that touched.
+//! A finer check of a stretch uses only what was near it in the coarser check. The spheres of a stretch are enlarged by how far they can move
+//! within it, and a walk notes what they touch then; what they do not touch is out of reach of every posture of the stretch. So a finer check, by
+//! shorter stretches or by postures, needs only what was noted ([`Among`]), and if nothing was noted the stretch is free. The result is that of a
+//! check against everything: a sphere that touches something in a posture has an enlarged sphere that touched it, too.
 //!
-//! Motions of the search are postures alone, and what is near them is not noted: most end in the first batch or have few.
+//! The motions of the search are checked in postures only and what is near is not noted: most end in the first batch or have few batches.
 
 use super::kernel::{self, Among, Compiled, Contact, Edge, First, LENGTH, Other, Scratch, Visitor};
 use super::lanes::{Block, Lanes};
 
-/// How spheres move with each joint: of each joint a list over the rigid parts, then the groups, so that many are added up at once.
+/// Bounds for the motion of spheres per joint: for each joint a list over the rigid parts and then the groups, so that many are added at once.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Spans {
-    /// How far they turn for one radian; zero for joints that slide.
+    /// Rotation for one radian; zero for prismatic joints.
     pub(crate) turns: Vec<Vec<f32>>,
-    /// How far a point of them moves at most for one radian; for one metre of a joint that slides, twice that.
+    /// Maximum motion of a point for one radian; for one metre of a prismatic joint, twice that.
     pub(crate) ways: Vec<Vec<f32>>,
-    /// Of each rigid part and group, the radius of its bounding sphere.
+    /// Radius of the bounding sphere of each rigid part and group.
     pub(crate) radii: Vec<f32>,
 }
 
-/// Something that a group touches in some lanes, a bit each, when its spheres are grown.
+/// Something that a group touches when its spheres are enlarged, with the mask of the lanes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Near {
     pub(super) group: u32,
@@ -29,7 +29,7 @@ pub(crate) struct Near {
     pub(super) lanes: u32,
 }
 
-/// Notes all that is touched.
+/// A visitor that notes all contacts.
 struct Notes<'a>(&'a mut Vec<Near>);
 
 impl Visitor for Notes<'_> {
@@ -37,7 +37,7 @@ impl Visitor for Notes<'_> {
 
     #[inline(always)]
     fn touch(&mut self, Contact { group, other, .. }: Contact, lanes: u32) -> bool {
-        // The spheres of a group come one after the other.
+        // Contacts of one group come one after the other.
         match self.0.last_mut() {
             Some(last) if last.group == group && last.other == other => last.lanes |= lanes,
             _ => self.0.push(Near { group, other, lanes }),
@@ -46,12 +46,12 @@ impl Visitor for Notes<'_> {
     }
 }
 
-/// How much larger spheres are than they are, beside half of the greatest step of their bounding sphere: for each rigid part, then each group.
+/// Enlargement of the spheres in addition to half of the maximum step of their bounding sphere: for each rigid part, then each group.
 #[derive(Debug, Clone)]
 pub(super) struct Growth {
     by: Vec<f32>,
     turned: Vec<f32>,
-    /// For postures alone nothing grows.
+    /// Without this, for postures only, nothing is enlarged.
     is_on: bool,
 }
 
@@ -61,22 +61,22 @@ impl Growth {
         Growth { by: none.clone(), turned: none, is_on: false }
     }
 
-    /// As far as anything moves in this part of a motion, half of the way from lane to lane.
+    /// Sets the enlargement for a part of a motion: half of the way from lane to lane.
     #[inline(always)]
     fn set(&mut self, spans: &Spans, delta: &[f32; LENGTH], part: f32) {
         self.is_on = true;
         add_up(&spans.turns, delta, part, &mut self.turned);
         add_up(&spans.ways, delta, part, &mut self.by);
         for ((by, turned), radius) in self.by.iter_mut().zip(&self.turned).zip(&spans.radii) {
-            // The second derivative by two joints that turn is no longer than the lever of the later one. The mean speed of a
-            // step differs from that anywhere in it and half a step beyond by what it changes in one step at most.
+            // The second derivative by two rotating joints is at most the lever of the later one. The mean speed of a step differs from the speed
+            // anywhere in it, and half a step beyond, by at most its change in one step.
             let bend = 2.0 * turned * *by;
-            // Points beside the centre of the bounding sphere turn about it.
+            // Points away from the centre of the bounding sphere rotate about it.
             *by = bend + turned * radius;
         }
     }
 
-    /// How much larger the spheres about a centre are in this batch.
+    /// The enlargement of the spheres with this centre in this batch.
     #[inline(always)]
     pub(super) fn of<V: Lanes>(&self, index: usize, centre: &[Block; 3]) -> f32 {
         if self.is_on { self.by[index] + 0.5 * greatest_step(centre, V::WIDTH) } else { 0.0 }
@@ -94,7 +94,7 @@ fn add_up(spans: &[Vec<f32>], delta: &[f32; LENGTH], part: f32, to: &mut [f32]) 
     }
 }
 
-/// How far a point goes from one lane to the next at most.
+/// Maximum motion of a point from one lane to the next.
 #[inline(always)]
 fn greatest_step(point: &[Block; 3], width: usize) -> f32 {
     let mut squares = [0.0_f32; 15];
@@ -107,7 +107,7 @@ fn greatest_step(point: &[Block; 3], width: usize) -> f32 {
     squares[..width - 1].iter().fold(0.0, |most: f32, square| if *square > most { *square } else { most }).sqrt()
 }
 
-/// Whether no posture touches anything.
+/// Whether all postures are free of collisions.
 #[inline(always)]
 pub(super) fn is_free<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
     let Among { depth, lanes } = edge.among;
@@ -134,8 +134,7 @@ pub(super) fn is_free<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> bool 
     true
 }
 
-/// In which of up to sixteen postures one of the remembered contacts is there again, a bit each; of each joint a block. The postures have nothing to
-/// do with each other.
+/// The mask of up to sixteen independent postures in which one of the remembered contacts occurs again; one block per joint.
 #[inline(always)]
 pub(super) fn touching_again<V: Lanes>(
     compiled: &Compiled,
@@ -152,11 +151,11 @@ pub(super) fn touching_again<V: Lanes>(
     touching
 }
 
-/// Which steps of a batch may touch something, a bit each. What they may touch is in the list of this depth then.
+/// The mask of the steps of a batch that may be in collision. What they may touch is in the list of this depth afterwards.
 #[inline(always)]
 pub(super) fn near<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
     let Among { depth, lanes } = edge.among;
-    // Each posture stands for the step that it is in the middle of: nothing is further than half a step from one.
+    // Each posture stands for the step around it: nothing is further than half a step from a posture.
     let part = 0.5 / V::WIDTH as f32;
     let start: [f32; LENGTH] = std::array::from_fn(|joint| edge.start[joint] - edge.delta[joint] * part);
     let edge = &Edge { start: &start, ..*edge };

@@ -1,6 +1,6 @@
-//! A convex shape in its place, as the judge sees it: a point, a line, a triangle, a box or a cylinder, and all that is within a radius of that.
+//! A convex shape with its pose, as the judge sees it: a point, a line, a triangle, a box or a cylinder, and all points within a radius of it.
 //!
-//! All numbers are in `f64` and in the world frame. The shapes are read from the bodies that the engine moves.
+//! All numbers are `f64` and in the world frame. The shapes are read from the bodies that the physics engine moves.
 
 use super::vector::Vector;
 use rapier3d::math::{Pose as Pose32, Vector as Vector32};
@@ -8,24 +8,24 @@ use rapier3d::parry::shape::Shape;
 use ratn_model::pose::Pose;
 use std::f64::consts::TAU;
 
-/// A shape in its place.
+/// A shape with its pose.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Convex {
-    /// Where its middle is, in the world frame.
+    /// Its centre, in the world frame.
     pub(super) middle: Vector,
     core: Core,
-    /// All points within this of the core belong to it, in metres.
+    /// All points within this distance of the core belong to the shape, in metres.
     pub(super) radius: f64,
 }
 
-/// What a shape is without its radius, as seen from its middle, along the axes of the world.
+/// The core of a shape, without its radius, relative to its centre and along the axes of the world.
 #[derive(Debug, Clone, Copy)]
 enum Core {
     Point,
-    /// From the middle to one of its ends.
+    /// From the centre to one end.
     Line(Vector),
     Triangle([Vector; 3]),
-    /// Half of its edges.
+    /// Half extents as vectors.
     Box([Vector; 3]),
     Cylinder {
         axis: Vector,
@@ -34,14 +34,14 @@ enum Core {
     },
 }
 
-/// Corners of a round face.
+/// Number of corners that approximate a round face.
 const ROUND: u32 = 32;
 
 impl Convex {
-    /// A shape of a body; `None` of a kind that no body of the cell has.
+    /// The shape of a body; `None` for a kind that no body of the cell has.
     pub(super) fn of(shape: &dyn Shape, place: &Pose32) -> Option<Convex> {
         let [x, y, z, w] = place.rotation.to_array().map(f64::from);
-        // Rounding to `f32` has left it not quite of length 1.
+        // After rounding to `f32` the quaternion is not exactly of length 1.
         let length = (x * x + y * y + z * z + w * w).sqrt();
         let turn = Pose { position: [0.0; 3], quaternion_xyzw: [x, y, z, w].map(|c| c / length) };
         let turned = |Vector(v): Vector| Vector(turn.rotate(v));
@@ -63,13 +63,12 @@ impl Convex {
         placed(at, Core::Cylinder { axis: axes[1], radius, half_length }, 0.0)
     }
 
-    /// A triangle.
     pub(super) fn triangle(corners: [Vector; 3]) -> Convex {
         let middle = corners.into_iter().sum::<Vector>() * (1.0 / 3.0);
         Convex { middle, core: Core::Triangle(corners.map(|corner| corner - middle)), radius: 0.0 }
     }
 
-    /// The point of its core that is farthest along a direction.
+    /// The support point of the core: the farthest along a direction.
     pub(super) fn farthest(&self, way: Vector) -> Vector {
         let along = |edge: Vector| if edge.dot(way) < 0.0 { -edge } else { edge };
         let from_middle = match self.core {
@@ -87,16 +86,16 @@ impl Convex {
         self.middle + from_middle
     }
 
-    /// Whether it has flat faces alone.
+    /// Whether it has only flat faces.
     pub(super) fn is_flat(&self) -> bool {
         !matches!(self.core, Core::Cylinder { .. })
     }
 
-    /// Directions across its faces.
+    /// Normals of its faces.
     pub(super) fn across(&self) -> Vec<Vector> {
         match self.core {
             Core::Point => Vec::new(),
-            // It has no face; but what two lines have in common is in planes that hold one of them.
+            // A line has no face; but the common points of two lines are in planes that contain one of them.
             Core::Line(half) => half.direction().into_iter().flat_map(Vector::across).collect(),
             Core::Triangle([a, b, c]) => vec![(b - a).cross(c - b)],
             Core::Box(half) => half.to_vec(),
@@ -115,8 +114,8 @@ impl Convex {
         }
     }
 
-    /// The corners of its core that are farthest along a direction, or less far by `within_m` metres at the most: a point, the ends of an edge, or those
-    /// of a face.
+    /// The corners of its core that are farthest along a direction, and those that are at most `within_m` metres less far: a point, the ends of an
+    /// edge, or the corners of a face.
     pub(super) fn face(&self, way: Vector, within_m: f64) -> Vec<Vector> {
         let corners: Vec<Vector> = match self.core {
             Core::Point => vec![Vector::ZERO],
@@ -140,9 +139,9 @@ impl Convex {
     }
 }
 
-/// The direction away from an axis that has most of another one; `None` of what is along the axis.
+/// The unit vector perpendicular to an axis that is nearest to `way`; `None` if `way` is along the axis.
 fn outward(way: Vector, axis: Vector) -> Option<Vector> {
-    // What is left of a direction that is nearly along the axis has a part along it that rounding has left there.
+    // If the direction is nearly along the axis, normalising amplifies the rounding error along it, so that part is removed again.
     way.beside(axis).direction().map(|out| out.beside(axis))
 }
 

@@ -1,41 +1,40 @@
-//! What two flat fingers hold by friction, and how it slips when that is not enough.
+//! What two flat fingers hold by friction, and how it slips if that is not enough.
 //!
-//! The pads press with a force `N` each; a patch of each touches the object. Seen in the plane of the pads (x and z of the tool frame)
-//! friction can bear a force and a torque about the closing axis (y) within an ellipsoid, the limit surface of Howe and Cutkosky
-//! ("Practical force-motion models for sliding manipulation", IJRR 1996): (f / f_max)² + (τ / τ_max)² ≤ 1 with f_max = 2 μ N and
-//! τ_max = f_max times the mean lever of the patch. Within it the object sticks; outside it slides along the surface's normal, so a
-//! box held too weakly slides down and one held off its centre of mass turns until it hangs. Whoever calls looks whether enough of
-//! it is left between the pads.
+//! Each pad presses with a force `N`; a patch of each touches the object. In the plane of the pads (x and z of the tool frame) friction can bear a
+//! force and a torque about the closing axis (y) within an ellipsoid, the limit surface of Howe and Cutkosky ("Practical force-motion models for
+//! sliding manipulation", IJRR 1996): (f / f_max)² + (τ / τ_max)² ≤ 1 with f_max = 2 μ N and τ_max = f_max times the mean lever of the patch.
+//! Within it the object sticks; outside it slides along the normal of the surface. So a box held too weakly slides down, and one held off its
+//! centre of mass turns until it hangs. The caller checks whether enough of it is left between the pads.
 
 use ratn_model::pose::Pose;
 
-/// How firmly the pads hold.
+/// Force and friction of a grip.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Grip {
     /// Newtons per finger.
     pub force_n: f64,
-    /// Coulomb's coefficient between pads and object.
+    /// Coulomb's friction coefficient between pads and object.
     pub friction: f64,
 }
 
-/// What is held, in the frame of the tool.
+/// The held object, in the frame of the tool.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hold {
     /// The object's frame; its centre of mass is its origin.
     pub in_tool: Pose,
-    /// Where the pads touch it, least and greatest x and z, in metres.
+    /// The patch where the pads touch it: minimum and maximum x and z, in metres.
     pub patch: [[f64; 2]; 2],
-    /// Kilograms.
+    /// Mass in kilograms.
     pub mass_kg: f64,
-    /// About the closing axis through the centre of mass, kg m².
+    /// Moment of inertia about the closing axis through the centre of mass, in kg m².
     pub inertia: f64,
 }
 
-/// What pulls at it: the gravity that is felt in the accelerated tool frame, m/s².
+/// The load on the object: gravity as felt in the accelerated tool frame, in m/s².
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Load(pub [f64; 3]);
 
-/// How it slides through the pads: along x and z in m/s, about y in rad/s.
+/// The sliding velocity of the object between the pads: along x and z in m/s, about y in rad/s.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Slip {
     /// Metres per second along the tool's x and z.
@@ -44,31 +43,31 @@ pub struct Slip {
     pub about: f64,
 }
 
-/// The mean distance of a disc's points from its middle, as a part of its radius.
+/// Mean distance of a disc's points from its centre, as a fraction of its radius.
 const MEAN_LEVER: f64 = 2.0 / 3.0;
 
 impl Slip {
-    /// Whether it sticks.
+    /// Whether the object sticks.
     pub fn is_none(&self) -> bool {
         *self == Slip::default()
     }
 }
 
 impl Grip {
-    /// How much of what friction can bear the load takes: above 1 it slips.
+    /// The fraction of the friction limit that the load takes: above 1 the object slips.
     pub fn strain(&self, hold: &Hold, load: &Load) -> f64 {
         let (force, torque, limits) = self.balance(hold, load);
         strain(force, torque, limits)
     }
 
-    /// One step of `dt` seconds: the slip after it, and where the object is in the tool frame then.
+    /// One step of `dt` seconds: returns the slip after it, and the pose of the object in the tool frame.
     pub fn step(&self, hold: &Hold, load: &Load, slip: Slip, dt: f64) -> (Slip, Pose) {
         let (force, torque, limits) = self.balance(hold, load);
         let excess = strain(force, torque, limits);
         if slip.is_none() && excess <= 1.0 {
             return (Slip::default(), hold.in_tool);
         }
-        // Friction acts against the sliding, or against the load that begins it, from where the limit surface's normal points there.
+        // Friction acts against the sliding velocity, or against the load that starts the slip, along the normal of the limit surface there.
         let [f_max, t_max] = limits;
         let friction = if slip.is_none() {
             ([-force[0] / excess, -force[1] / excess], -torque / excess)
@@ -82,7 +81,7 @@ impl Grip {
             along: [0, 1].map(|i| slip.along[i] + (force[i] + friction.0[i]) / hold.mass_kg * dt),
             about: slip.about + (torque + friction.1) / hold.inertia * dt,
         };
-        // Friction stops, it does not push back.
+        // Friction stops the object, it does not push it back.
         let still = next.along[0] * slip.along[0] + next.along[1] * slip.along[1] + next.about * slip.about <= 0.0;
         if excess <= 1.0 && still {
             return (Slip::default(), hold.in_tool);
@@ -96,7 +95,7 @@ impl Grip {
         (next, in_tool)
     }
 
-    /// The force in the pads' plane, the torque about the patch's middle, and the most that friction bears of either.
+    /// The force in the plane of the pads, the torque about the centre of the patch, and the maxima of both that friction bears.
     fn balance(&self, hold: &Hold, load: &Load) -> ([f64; 2], f64, [f64; 2]) {
         let force = [load.0[0] * hold.mass_kg, load.0[2] * hold.mass_kg];
         let [px, pz] = middle(hold);
@@ -122,7 +121,7 @@ fn middle(hold: &Hold) -> [f64; 2] {
 mod tests {
     use super::*;
 
-    /// Gravity in a tool that looks down.
+    /// Gravity for a tool that points down.
     const DOWN: Load = Load([0.0, 0.0, 9.81]);
     const PATCH: [[f64; 2]; 2] = [[-0.0125, 0.0125], [-0.03, 0.015]];
 
@@ -152,7 +151,7 @@ mod tests {
         let grip = Grip { force_n: 3.0, friction: 0.6 };
         let (_, after) = slide(grip, hold(0.0), 0.1);
         let fallen = after.position[2] - 0.02;
-        // Gravity less friction: 9.81 - 2 · 0.6 · 3 / 0.5 m/s².
+        // Gravity minus friction: 9.81 - 2 · 0.6 · 3 / 0.5 m/s².
         assert!((fallen - 0.5 * (9.81 - 7.2) * 0.01).abs() < 0.1 * fallen, "{fallen}");
         assert!(after.position[0].abs() < 1e-9);
     }

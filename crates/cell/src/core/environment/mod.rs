@@ -1,9 +1,9 @@
 //! The environment's physics: rigid bodies, friction, a fixed step.
 //!
-//! rapier3d moves what can be moved; floor and furniture stand still, and the robot's links go where its joints are, whatever is
-//! in their way. `grip` says what the fingers can hold, `riding` what goes along with a base that drives, `touch`
-//! what touches what, planned or not, and `overlap` how deep. Nothing here reads a clock: the step is fixed, time is the number of steps,
-//! and the same steps with the same joints give the same world to the last bit on one machine ([`Environment::digest`]).
+//! rapier3d moves everything that can be moved. Floor and furniture are fixed, and the robot's links follow its joints, whatever is in their way.
+//! `grip` computes what the fingers can hold, `riding` which objects move with a driving base, `touch` all contacts, planned or not, and `overlap`
+//! their depth. Nothing here reads a clock: the step is fixed, time is the number of steps, and the same steps with the same joints give the same
+//! world to the last bit on one machine ([`Environment::digest`]).
 
 mod convex;
 mod grip;

@@ -1,8 +1,8 @@
-//! What stands around in the cell: its shape as convex parts, its mass, and how it rubs.
+//! The objects of the cell: their shapes as convex parts, masses and friction.
 //!
-//! An object's frame sits in the middle of its bounding box, z up when it stands as it was made to. Bowls and cups are hollow:
-//! a ring of slabs on a disc, so that something can lie in them and a finger can reach in. Thicknesses and masses are those of
-//! small load carriers, porcelain and cutlery.
+//! The origin of an object's frame is the centre of its bounding box, with z up when the object stands upright. Bowls and cups are hollow: a ring
+//! of slabs on a disc, so that something can lie in them and a finger can reach in. Thicknesses and masses are those of small load carriers,
+//! porcelain and cutlery.
 
 use ratn_model::pose::Pose;
 use ratn_perception::model::{Model as Seen, Round};
@@ -10,7 +10,7 @@ use ratn_world::scene::Shape;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::{PI, TAU};
 
-/// What something is.
+/// The kind of an object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
@@ -26,30 +26,30 @@ pub enum Kind {
     Fork,
 }
 
-/// Something that can be moved.
+/// An object that can be moved.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Model {
-    /// What it is.
+    /// Its kind.
     pub kind: Kind,
-    /// Its extents along x, y, z in metres; round things are as deep as they are wide.
+    /// Its extents along x, y, z in metres; round objects are as deep as they are wide.
     pub size: [f64; 3],
 }
 
-/// How thick the walls of bowls and cups are, in metres.
+/// Thickness of the walls of bowls and cups, in metres.
 const WALL_M: f64 = 0.004;
-/// How many slabs a round wall has.
+/// Number of slabs of a round wall.
 const SLABS: u32 = 16;
-/// The foot of plates and bowls, as a part of their greatest width.
+/// Width of the foot of plates and bowls, as a fraction of their greatest width.
 pub(super) const FOOT: f64 = 0.6;
-/// How much of a fork's length its handle is, and how wide that is as a part of its head.
+/// Length of a fork's handle as a fraction of the fork's length, and its width as a fraction of that of the head.
 const HANDLE: f64 = 0.7;
 const HANDLE_WIDTH: f64 = 0.4;
-/// How far down from the rim fingers hold what they hold by its rim, and how much of its round they meet as a flat wall, in metres.
+/// For objects held by their rim: how far below the rim the fingers hold, and the width of the rim that counts as a flat wall, in metres.
 const RIM_M: f64 = 0.02;
 const RIM_WIDTH_M: f64 = 0.03;
 
 impl Kind {
-    /// As in a text.
+    /// Its name in texts.
     pub fn name(self) -> &'static str {
         match self {
             Kind::Box => "box",
@@ -60,7 +60,7 @@ impl Kind {
         }
     }
 
-    /// Kilograms per cubic metre of its outline.
+    /// Density, in kilograms per cubic metre of its bounding box.
     fn density(self) -> f64 {
         match self {
             Kind::Box => 400.0,
@@ -71,7 +71,7 @@ impl Kind {
         }
     }
 
-    /// Coulomb's coefficient against wood and rubber.
+    /// Coulomb's friction coefficient against wood and rubber.
     pub fn friction(self) -> f64 {
         match self {
             Kind::Box => 0.6,
@@ -82,7 +82,7 @@ impl Kind {
 }
 
 impl Model {
-    /// Kilograms.
+    /// Its mass, in kilograms.
     pub fn mass_kg(&self) -> f64 {
         self.kind.density() * self.size.iter().product::<f64>()
     }
@@ -105,8 +105,8 @@ impl Model {
         }
     }
 
-    /// The cuboid of it that fingers at `tool` (in its frame, closing along y) can close around: all of a box or a cup, a fork's
-    /// handle or head, of what is wider the wall next to them. Of what is round only as wide a part as lies flat enough.
+    /// The cuboid that fingers at `tool` (in the object's frame, closing along y) can close around: all of a box or a cup, a fork's handle or
+    /// head, and for wider objects the wall next to the fingers. Of a round wall only the width that is flat enough.
     pub fn grip_part(&self, tool: &Pose) -> (Pose, [f64; 3]) {
         let [x, y, z] = self.size;
         let [at_x, at_y, _] = tool.position;
@@ -122,7 +122,7 @@ impl Model {
             }
             Kind::Cup => {
                 let closing = tool.rotate([0.0, 1.0, 0.0]);
-                // Flat fingers meet its round at a line each: what is farther to the side slides out from between them.
+                // Each flat finger touches the round wall along a line: what is farther to the side slides out from between them.
                 (Pose::from_rpy([0.0; 3], 0.0, 0.0, closing[1].atan2(closing[0])), [x, RIM_WIDTH_M, z])
             }
             Kind::Plate | Kind::Bowl => {
@@ -134,15 +134,15 @@ impl Model {
         }
     }
 
-    /// By how much its rim leans outwards, in radians, where that is so much that fingers which close around it from above slide off:
-    /// friction holds up to a lean of its own angle.
+    /// Lean of the rim outwards, in radians, if fingers that close around it from above slide off: friction holds up to a lean of the friction
+    /// angle.
     pub fn slips_off(&self) -> Option<f64> {
         let is_held_by_it = matches!(self.kind, Kind::Bowl | Kind::Plate);
         let lean = self.seen().rim_lean().filter(|_| is_held_by_it)?;
         (lean.tan() > self.kind.friction()).then_some(lean)
     }
 
-    /// What turns about its upright axis leave the same.
+    /// Whether rotations about its upright axis leave it the same.
     pub fn is_round(&self) -> bool {
         matches!(self.kind, Kind::Plate | Kind::Bowl | Kind::Cup)
     }
@@ -161,12 +161,12 @@ impl Model {
     }
 }
 
-/// An upright disc with its middle at a height.
+/// An upright disc with its centre at a height.
 fn disc(height: f64, radius: f64, thickness: f64) -> (Pose, Shape) {
     (Pose::at(0.0, 0.0, height), Shape::Cylinder { radius, length: thickness })
 }
 
-/// A bottom and a ring of slabs that lean outwards from the bottom's radius to the rim's.
+/// A bottom and a ring of slabs that lean outwards from the radius of the bottom to that of the rim.
 fn hollow(bottom: f64, rim: f64, height: f64) -> Vec<(Pose, Shape)> {
     let mut parts = vec![disc((WALL_M - height) / 2.0, bottom, WALL_M)];
     let lean = ((rim - bottom) / height).atan();

@@ -1,15 +1,16 @@
-//! How deep two convex shapes are in each other, or how far apart, by a search among all directions.
+//! Penetration depth of two convex shapes, or their distance, by a search over all directions.
 //!
-//! Along a direction n the shapes overlap by `h(n)`: how far the first reaches along n beyond where the second begins. The second, moved by that
-//! much along n, is free of the first. So the least `h(n)` of all directions is how deep they are in each other, and where it is negative how
-//! far they are apart. It is found by branch and bound (Land and Doig 1960): the directions are split into ever smaller triangles, and of each a bound is
-//! known below which no `h(n)` in it is. The search ends when no triangle is left in which it could be less by [`PRECISE_M`].
+//! Along a direction n the shapes overlap by `h(n)`: how far the first reaches along n beyond where the second begins. Translated by that much
+//! along n, the second shape is free of the first. So the minimum of `h(n)` over all directions is the penetration depth, and if it is negative,
+//! its absolute value is the distance. The minimum is found by branch and bound (Land and Doig 1960): the directions are split into ever smaller
+//! triangles, and each triangle has a lower bound of its `h(n)`. The search ends when no triangle is left in which `h(n)` could be less by
+//! [`PRECISE_M`].
 //!
-//! The bound. All differences `p` of a point of the first and one of the second have `h(n) >= n·p`. Three of them, farthest along the corners
-//! `u` of a triangle, make a game: who chooses n wants the greatest of its `n·p` as small as can be. The value of that game (von Neumann 1928), with the
-//! payoffs `u·p`, is the bound: n is a sum of the corners with weights of at least one in all.
+//! The bound. All differences `p` of a point of the first shape and one of the second satisfy `h(n) >= n·p`. Three of them, the farthest along the
+//! corners `u` of a triangle, define a matrix game: one player chooses n and wants the greatest of its `n·p` to be as small as possible. The value
+//! of that game (von Neumann 1928), with the payoffs `u·p`, is the bound: n is a sum of the corners whose weights add up to at least one.
 //!
-//! Nothing of this is shared with the planner's distances, which go the other way: from points inwards.
+//! Nothing of this is shared with the planner's distances, which work the other way: from points inwards.
 
 use super::convex::Convex;
 use super::polygon::Polygon;
@@ -17,44 +18,44 @@ use super::vector::Vector;
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
-/// How two shapes meet.
+/// A contact of two shapes, or their distance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Meeting {
-    /// How deep they are in each other, in metres; negative: how far apart.
+    /// Penetration depth in metres; negative: the distance.
     pub(super) depth_m: f64,
-    /// From the first to the second: along it they come apart.
+    /// Unit vector from the first shape to the second: along it they separate.
     pub(super) normal: Vector,
-    /// A place between them.
+    /// A point between them.
     pub(super) at: Vector,
 }
 
 impl Meeting {
-    /// The same, with the other one first.
+    /// The same with the two shapes exchanged.
     pub(super) fn turned(self) -> Meeting {
         Meeting { normal: -self.normal, ..self }
     }
 }
 
-/// How far a depth may be off, in metres, and the distance of two cores as a part of it: the directions to what is near are as precise.
+/// Error of a depth in metres, and of the distance of two cores as a fraction of it, so that directions between near cores are precise, too.
 const PRECISE_M: f64 = 1e-5;
 const PRECISE: f64 = 1e-4;
 const SMALLEST_M: f64 = 1e-8;
 
-/// Triangles that are looked at, at the most. Most pairs take some hundred; a rod in the middle of a tube takes ten thousand. What is found by then is
-/// not less than the depth.
+/// Maximum number of triangles of a search. Most pairs take some hundred; a rod in the middle of a tube takes ten thousand. The value found by
+/// then is an upper bound of the depth.
 const MAX_TRIANGLES: usize = 20_000;
 
-/// What is on a face where it is said where shapes meet, and where it is proven how far apart they are, in metres.
+/// Tolerance for a point to be on a face, in metres: for the position of a contact, and for the proof of a distance.
 const FACE_M: f64 = 1e-3;
 const EXACT_M: f64 = 1e-8;
 
-/// What is this near is at the same place, in metres.
+/// Points nearer to each other than this count as the same, in metres.
 const SAME_M: f64 = 1e-6;
 
-/// Steps towards a place between two faces.
+/// Number of steps towards a point between two faces.
 const STEPS: usize = 32;
 
-/// How two shapes meet, if they are no farther apart than `within_m` metres.
+/// The contact of two shapes, if they are no farther apart than `within_m` metres.
 pub(super) fn meeting(a: &Convex, b: &Convex, within_m: f64) -> Option<Meeting> {
     let (radii, pair) = (a.radius + b.radius, Pair { a, b });
     let farthest = -within_m - radii;
@@ -70,9 +71,10 @@ pub(super) fn meeting(a: &Convex, b: &Convex, within_m: f64) -> Option<Meeting> 
     }
     let mut least = least.unwrap_or_else(|| pair.along(Vector::AXES[2]));
     let is_sure = match least.overlap < 0.0 {
-        // Two points are as near to each other as the direction says that none are nearer.
+        // Proven if two points are as near to each other as the direction proves that no points are nearer.
         true => apart(&across(a, b, least.way, EXACT_M)) <= SAME_M,
-        // Shapes with flat faces that overlap come apart across a face of one of them or across two edges (Gottschalk, Lin and Manocha 1996).
+        // Overlapping shapes with flat faces separate along the normal of a face of one of them or along the cross product of two edges
+        // (separating axes, Gottschalk, Lin and Manocha 1996).
         false => a.is_flat() && b.is_flat(),
     };
     if !is_sure {
@@ -81,26 +83,25 @@ pub(super) fn meeting(a: &Convex, b: &Convex, within_m: f64) -> Option<Meeting> 
     Some(Meeting { depth_m: least.overlap + radii, normal: least.way, at: place(a, b, least.way) })
 }
 
-/// Two shapes.
 struct Pair<'s> {
     a: &'s Convex,
     b: &'s Convex,
 }
 
-/// A direction, and how far the cores overlap along it.
+/// A direction, and the overlap of the cores along it.
 #[derive(Debug, Clone, Copy)]
 struct Corner {
     way: Vector,
-    /// The difference of their points that is farthest along it.
+    /// The difference of their points that is farthest along the direction.
     point: Vector,
     overlap: f64,
 }
 
-/// All directions between three.
+/// All directions between three corners.
 #[derive(Debug, Clone, Copy)]
 struct Triangle {
     corners: [Corner; 3],
-    /// Nowhere in it do the cores overlap by less.
+    /// Lower bound of the overlap of the cores within the triangle.
     bound: f64,
 }
 
@@ -110,7 +111,7 @@ impl Pair<'_> {
         Corner { way, point, overlap: point.dot(way) }
     }
 
-    /// Directions along which shapes often come apart.
+    /// Directions along which shapes often separate.
     fn guesses(&self) -> impl Iterator<Item = Vector> {
         let (faces, others) = (self.a.across(), self.b.across());
         let (edges, its) = (self.a.edges(), self.b.edges());
@@ -123,7 +124,7 @@ impl Pair<'_> {
         guesses.filter_map(Vector::direction).flat_map(|way| [way, -way])
     }
 
-    /// The direction along which the cores overlap least; `None` where that is less than `farthest`.
+    /// The direction along which the cores overlap least; `None` if that is less than `farthest`.
     fn search(&self, mut least: Corner, farthest: f64) -> Option<Corner> {
         let [x, y, z] = Vector::AXES.map(|axis| [self.along(axis), self.along(-axis)]);
         let eighth = |i: usize| Triangle::new([x[i & 1], y[i >> 1 & 1], z[i >> 2]]);
@@ -150,7 +151,7 @@ impl Pair<'_> {
 }
 
 impl Corner {
-    /// What is not less than this is not less than the overlap, as precise as is wanted.
+    /// Bounds at or above this need not be searched: they could improve the overlap only within the wanted precision.
     fn low_enough(&self) -> f64 {
         let precise = if self.overlap < 0.0 { (-PRECISE * self.overlap).max(SMALLEST_M) } else { PRECISE_M };
         self.overlap - precise.min(PRECISE_M)
@@ -161,12 +162,12 @@ impl Triangle {
     fn new(corners: [Corner; 3]) -> Triangle {
         let value = value(&corners.map(|row| corners.map(|column| row.way.dot(column.point))));
         let [a, b, c] = corners.map(|corner| corner.way);
-        // The weights of a direction between the corners are one in all where it is a corner, and no more than this.
+        // The weights of a direction between the corners add up to one at a corner, and to no more than `most()` anywhere.
         let most = || (b - a).cross(c - a).direction().map_or(f64::INFINITY, |across| 1.0 / across.dot(a).abs());
         Triangle { corners, bound: if value < 0.0 { value * most() } else { value } }
     }
 
-    /// Its longest edge is that from a corner to the next.
+    /// Index of the corner where its longest edge begins; the edge leads to the next corner.
     fn longest(&self) -> usize {
         let length = |i: &usize| (self.corners[*i].way - self.corners[(*i + 1) % 3].way).length();
         (0..3).max_by(|i, j| length(i).total_cmp(&length(j))).unwrap_or_default()
@@ -184,7 +185,7 @@ impl Triangle {
         [Triangle::new([a, middle, c]), Triangle::new([middle, b, c])]
     }
 
-    /// The direction across the plane of its points, on its own side: that of a face, where they are on one.
+    /// The normal of the plane through its points, on the triangle's side: the normal of a face if the points are on one.
     fn across(&self) -> Option<Vector> {
         let [a, b, c] = self.corners.map(|corner| corner.point);
         let way = (b - a).cross(c - a).direction()?;
@@ -192,7 +193,7 @@ impl Triangle {
     }
 }
 
-// The triangle with the least bound is looked at first.
+// The triangle with the lowest bound is split first.
 impl Ord for Triangle {
     fn cmp(&self, other: &Triangle) -> Ordering {
         other.bound.total_cmp(&self.bound)
@@ -213,8 +214,8 @@ impl PartialEq for Triangle {
 
 impl Eq for Triangle {}
 
-/// What who chooses columns of a game can be sure of, where the other chooses rows and wants it small: the best of what one column, a mixture of two, or one
-/// of three gives.
+/// Lower bound of a matrix game for the player who chooses columns, while the other chooses rows to make it small: the best guarantee of one
+/// column, a mixture of two, or one of three.
 fn value(payoffs: &[[f64; 3]; 3]) -> f64 {
     let sure = |weights: [f64; 3]| {
         let of = |row: &[f64; 3]| row[0] * weights[0] + row[1] * weights[1] + row[2] * weights[2];
@@ -225,7 +226,7 @@ fn value(payoffs: &[[f64; 3]; 3]) -> f64 {
         let k = (j + 1) % 3;
         best = best.max(sure(std::array::from_fn(|i| if i == j { 1.0 } else { 0.0 })));
         for row in 0..3 {
-            // Two rows give the same.
+            // The mixture for which two rows give the same.
             let [first, second] = [payoffs[row], payoffs[(row + 1) % 3]].map(|row| (row[j] - row[k], row[k]));
             let share = (second.1 - first.1) / (first.0 - second.0);
             if share > 0.0 && share < 1.0 {
@@ -242,14 +243,14 @@ fn value(payoffs: &[[f64; 3]; 3]) -> f64 {
             }
         }
     }
-    // All three rows give the same.
+    // The mixture for which all three rows give the same.
     let [a, b, c] = payoffs.map(Vector);
     let weights = (a - b).cross(a - c);
     let shares = weights.0.map(|weight| weight / weights.0.iter().sum::<f64>());
     if shares.iter().all(|share| *share >= 0.0) { best.max(sure(shares)) } else { best }
 }
 
-/// A place between two shapes that come apart along a direction: in both of the faces there, seen along it, or between their nearest points.
+/// A point between two shapes that separate along a direction: in both contact faces, seen along it, or between their nearest points.
 fn place(a: &Convex, b: &Convex, way: Vector) -> Vector {
     let [x, y] = way.across();
     let at = across(a, b, way, FACE_M);
@@ -257,7 +258,7 @@ fn place(a: &Convex, b: &Convex, way: Vector) -> Vector {
     (x * (at[0][0] + at[1][0]) + y * (at[0][1] + at[1][1]) + way * along) * 0.5
 }
 
-/// A point of each of the faces between two shapes, seen along a direction, that are near to each other; what is `within_m` behind is on the face, too.
+/// A point of each of the two contact faces, seen along a direction, near to each other; corners up to `within_m` behind count as on the face.
 fn across(a: &Convex, b: &Convex, way: Vector, within_m: f64) -> [[f64; 2]; 2] {
     let [x, y] = way.across();
     let seen = |face: Vec<Vector>| Polygon::around(face.iter().map(|p| [p.dot(x), p.dot(y)]).collect());
@@ -284,18 +285,18 @@ mod tests {
     use rapier3d::parry::shape::SharedShape;
     use std::f64::consts::PI;
 
-    /// Shapes as parry3d has them: sizes, from the middle outwards.
+    /// Shapes as in parry3d, given by their half extents.
     #[derive(Debug, Clone, Copy)]
     enum Form {
         Ball(f64),
         Box([f64; 3]),
-        /// Along y: radius and half of the length.
+        /// Along y: radius and half length.
         Cylinder(f64, f64),
         /// The same, with round ends.
         Capsule(f64, f64),
     }
 
-    /// A form that is turned about three axes and put somewhere: what brute force knows of it is how far a point is from it.
+    /// A form with a rotation about three axes and a position. Brute force uses only the distance of a point from it.
     #[derive(Debug, Clone, Copy)]
     struct Thing {
         form: Form,
@@ -313,7 +314,7 @@ mod tests {
                 3 | 4 => Form::Cylinder(a, b),
                 _ => Form::Capsule(a, b),
             };
-            // Upright ones meet in faces, lines and rims that lie in each other.
+            // Upright forms often touch in faces, lines and rims that coincide.
             let turn = match random.random_range(0..3) {
                 0 => [0.0, 0.0, PI / 2.0].map(|c| c * f64::from(random.random_range(0..2))),
                 _ => std::array::from_fn(|_| random.random_range(-PI..PI)),
@@ -354,7 +355,7 @@ mod tests {
             Convex::of(&*self.shape(), &self.pose()).unwrap()
         }
 
-        /// A point as seen from the thing, or back.
+        /// Converts a point to the frame of the form, or back.
         fn turned(&self, [x, y, z]: [f64; 3], back: bool) -> [f64; 3] {
             let about = |[x, y]: [f64; 2], by: f64| [x * by.cos() - y * by.sin(), x * by.sin() + y * by.cos()];
             let [rx, ry, rz] = self.turn;
@@ -371,7 +372,7 @@ mod tests {
             [x, y, z]
         }
 
-        /// How far a point is from its surface; negative inside.
+        /// Signed distance of a point from its surface; negative inside.
         fn distance(&self, point: [f64; 3]) -> f64 {
             let [x, y, z] = self.turned(point, false);
             let beyond = |sides: &[f64]| {
@@ -389,7 +390,7 @@ mod tests {
             }
         }
 
-        /// The point of it that is nearest to another.
+        /// The nearest of its points to another point.
         fn nearest(&self, point: [f64; 3]) -> [f64; 3] {
             let [x, y, z] = self.turned(point, false);
             let within = |[x, y, z]: [f64; 3], radius: f64| {
@@ -412,9 +413,9 @@ mod tests {
             self.turned(near, true)
         }
 
-        /// How far the nearest of its points, as far as random ones find it, is from the surface of another thing; or the first that is `enough`.
+        /// The least signed distance of its points, found by random search, from the surface of another form; stops at the first that is `enough`.
         fn least(&self, other: &Thing, enough: f64, random: &mut impl Rng) -> f64 {
-            // To and fro between them comes near, but slowly; random steps do the rest.
+            // Alternating projections approach it slowly; random steps do the rest.
             let mut best = self.nearest(other.at);
             for _ in 0..2000 {
                 let beside = other.nearest(best);
@@ -455,18 +456,18 @@ mod tests {
         }
     }
 
-    /// Two things near each other.
+    /// Two forms near each other.
     fn pair(random: &mut impl Rng) -> [Thing; 2] {
         let (a, b) = (Thing::random(random), Thing::random(random));
         let mut b = b.moved(away(direction(random), random.random_range(0.0..a.size() + b.size())));
-        // Most of them hardly touch.
+        // Most pairs hardly touch.
         let apart = a.least(&b, f64::NEG_INFINITY, random);
         if apart > 0.0 && random.random_range(0..4) > 0 {
             let Meeting { normal: Vector(way), .. } = meeting(&a.convex(), &b.convex(), f64::INFINITY).unwrap();
             let wanted = *[1e-2, 1e-3, 2e-4, -2e-4, -1e-3, -1e-2].get(random.random_range(0..6)).unwrap();
             b = b.moved(away(way, wanted - apart));
         }
-        // The shapes of the engine are in `f32`.
+        // The shapes of the engine are `f32`.
         let rounded = |c: f64| f64::from(c as f32);
         [a, Thing { at: b.at.map(rounded), ..b }]
     }
@@ -481,7 +482,7 @@ mod tests {
             let Vector(normal) = found.normal;
             let off = [&a, &b].map(|thing| thing.distance(found.at.0) - found.depth_m.abs() / 2.0);
             assert!(off.iter().all(|off| *off < 1e-2), "{found:?} is beside: {off:?} {a:?} {b:?}");
-            // Moved as far as was found, they are just free of each other.
+            // Moved by the depth that was found, the shapes are just free of each other.
             let freed = a.least(&b.moved(away(normal, found.depth_m + OFF_M)), f64::NEG_INFINITY, &mut random);
             assert!(freed > 0.0, "{found:?} is not enough: {freed} {a:?} {b:?}");
             if found.depth_m < 0.0 {
@@ -490,7 +491,7 @@ mod tests {
                 assert!((least + found.depth_m).abs() < OFF_M, "{found:?} instead of {least}: {a:?} {b:?}");
                 continue;
             }
-            // No way is shorter.
+            // No shorter translation separates them.
             let less = found.depth_m - OFF_M;
             if less > 0.0 {
                 deep += 1;
@@ -506,6 +507,6 @@ mod tests {
 
     const PAIRS: usize = 400;
     const WAYS: usize = 20;
-    /// What random points do not find, in metres.
+    /// Error of the random search, in metres.
     const OFF_M: f64 = 1e-4;
 }

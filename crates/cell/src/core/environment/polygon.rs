@@ -5,7 +5,7 @@
 pub(super) struct Polygon(Vec<[f64; 2]>);
 
 impl Polygon {
-    /// The polygon of these corners, at least one, in any order.
+    /// The polygon of these corners (at least one), given in any order.
     pub(super) fn around(corners: Vec<[f64; 2]>) -> Polygon {
         let mut polygon = Polygon(corners);
         let [x, y] = polygon.middle();
@@ -16,13 +16,13 @@ impl Polygon {
         polygon
     }
 
-    /// The middle of its corners.
+    /// The mean of its corners.
     pub(super) fn middle(&self) -> [f64; 2] {
         let count = self.0.len().max(1) as f64;
         [0, 1].map(|i| self.0.iter().map(|corner| corner[i]).sum::<f64>() / count)
     }
 
-    /// The point of it that is nearest to another.
+    /// The nearest of its points to another point.
     pub(super) fn nearest(&self, to: [f64; 2]) -> [f64; 2] {
         let edges = || self.0.iter().zip(self.0.iter().cycle().skip(1));
         let turn = |([ax, ay], [bx, by]): (&[f64; 2], &[f64; 2])| (bx - ax) * (to[1] - ay) - (by - ay) * (to[0] - ax);

@@ -1,16 +1,16 @@
-//! What rides: things that stand still on the robot while its base drives.
+//! Riding: objects that stand still on the robot while its base drives.
 //!
-//! Friction takes along what stands on a deck that moves gently. To work that out contact by contact, at every step, is most of what a drive
-//! costs, and it always comes to the same; so what has stood still on the deck for a while is put where the deck has it, as a body at rest
-//! is put to sleep, only that what it rests on moves.
+//! Friction moves objects along with a deck that moves gently. Computing that contact by contact, at every step, is most of what a drive costs,
+//! and always has the same result. So an object that has stood still on the deck for a while is placed relative to the deck: as a body at rest is
+//! put to sleep, except that its support moves.
 //!
 //! ```text
 //! free ──all that is awake has stood still on the deck for a while──▶ rides ──the base stands──▶ asleep
 //!  ▲                                                                    │
 //!  └── something else is awake, or would slide or tip: all that rides ──┘ is let go, as fast as it was
 //! ```
-//! It would slide where it is accelerated by more than friction gives (Coulomb), and tip where its centre of mass pushes beyond its
-//! foot; half of either is kept in reserve. What stands on something that rides does not ride.
+//! A rider would slide if its acceleration is more than friction gives (Coulomb), and tip if its centre of mass pushes beyond its foot; half of
+//! either limit is kept in reserve. An object that stands on a rider does not ride.
 
 use super::object::{Kind, Model};
 use super::world::{Environment, GRAVITY, ObjectState, ROBOT_FRICTION, STEP, Support};
@@ -20,44 +20,44 @@ use ratn_model::pose::Pose;
 use ratn_motion::drive::wrapped;
 use ratn_motion::robot::{Configuration, Robot, to_f32};
 
-/// For how many steps everything has to have stood still on the deck before it rides.
+/// Number of steps for which everything has to have stood still on the deck before it rides.
 const STILL_STEPS: u32 = 75;
-/// What counts as that, in metres and in radians per second.
+/// Maximum speeds that count as standing still, in metres and in radians per second.
 const STILL_M: f32 = 0.005;
 const STILL_RAD: f32 = 0.05;
-/// The part of what friction and a foot would bear that is made use of.
+/// Fraction of the limits of friction and foot that is used.
 const USED: f64 = 0.5;
-/// How far what rides may lean, in radians.
+/// Maximum lean of a rider, in radians.
 const MAX_LEAN_RAD: f64 = 0.05;
 
-/// What rides, and for how long it could have.
+/// The riders, and for how long everything has stood still.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Riding {
-    /// Objects, and where each is as seen from the base.
+    /// Objects, with the pose of each in the frame of the base.
     riders: Vec<(usize, Pose)>,
-    /// Steps since something that is awake moved on the deck.
+    /// Steps since an awake object moved on the deck.
     still: u32,
 }
 
 impl Riding {
-    /// As it was saved.
+    /// From a saved state.
     pub(super) fn restored(riders: Vec<(usize, Pose)>) -> Riding {
         Riding { riders, still: 0 }
     }
 
-    /// Whether something rides.
+    /// Whether any object rides.
     pub(super) fn is_under_way(&self) -> bool {
         !self.riders.is_empty()
     }
 
-    /// Where an object that rides is as seen from the base.
+    /// The pose of a rider in the frame of the base.
     pub(super) fn seat(&self, object: usize) -> Option<Pose> {
         self.riders.iter().find(|(rider, _)| *rider == object).map(|(_, seat)| *seat)
     }
 }
 
 impl Environment {
-    /// Before a step in which the joints come to `configuration`: what rides goes along, or does not any more.
+    /// Called before a step in which the joints move to `configuration`: the riders move along, or stop riding.
     pub(super) fn take_along(&mut self, robot: &Robot, configuration: &Configuration) {
         if !self.riding.is_under_way() {
             return;
@@ -79,7 +79,7 @@ impl Environment {
             }
             return;
         }
-        // They fall asleep where they are, or are left to themselves, as fast as they were.
+        // The riders fall asleep where they are, or move freely with the velocity that they had.
         let before = Configuration { base: self.base, ..*configuration };
         self.reseat(robot, &before, |_, state| {
             if state.rides.take().is_some() && go {
@@ -88,7 +88,8 @@ impl Environment {
         });
     }
 
-    /// After a step in which the joints came to `configuration`, the base from `before`: whether what moves with it rides from now on.
+    /// Called after a step in which the joints moved to `configuration` and the base moved from `before`: objects that move with it may begin to
+    /// ride.
     pub(super) fn board(&mut self, robot: &Robot, configuration: &Configuration, before: [f64; 3]) {
         if before == self.base || self.riding.is_under_way() {
             self.riding.still = 0;
@@ -123,19 +124,19 @@ impl Environment {
         }
     }
 
-    /// An object goes where it is put from now on, or is left to itself.
+    /// An object stops riding, because it is carried or moves freely from now on.
     pub(super) fn alight(&mut self, object: usize) {
         self.riding.riders.retain(|(rider, _)| *rider != object);
     }
 
-    /// All bodies are made again, as `change` leaves them: the solver remembers contacts of what moved otherwise.
+    /// Makes all bodies anew, as `change` modifies them: the solver remembers contacts of the motion before.
     fn reseat(&mut self, robot: &Robot, configuration: &Configuration, change: impl Fn(usize, &mut ObjectState)) {
         let mut saved = self.saved();
         saved.objects.iter_mut().enumerate().for_each(|(i, (_, state))| change(i, state));
         self.make_again(robot, configuration, &saved);
     }
 
-    /// What moves by itself.
+    /// The objects that move by themselves.
     fn awake(&self) -> impl Iterator<Item = usize> + '_ {
         (0..self.len()).filter(|object| self.moves(self.body(*object)))
     }
@@ -146,7 +147,7 @@ impl Environment {
     }
 }
 
-/// Whether friction and its foot hold something on a deck that accelerates it by so many m/s².
+/// Whether friction and its foot hold an object on a deck with this acceleration, in m/s².
 fn holds(model: &Model, pose: &Pose, acceleration: f64) -> bool {
     let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| pose.rotate(axis)[2].abs());
     let Some(up) = (0..3).max_by(|a, b| axes[*a].total_cmp(&axes[*b])) else { return false };

@@ -1,7 +1,7 @@
-//! A mesh of a link as the judge sees it: its triangles as they are, not the convex pieces that the engine has for them.
+//! A mesh of a link as the judge sees it: its triangles as they are, not the convex pieces that the physics engine uses.
 //!
-//! It touches something where a triangle meets that, or where one is wholly inside the other. How deep is the most that one triangle, or one corner, has to be
-//! moved: so it is never more than the links have to be. The work of a look has a bound.
+//! It touches another shape if a triangle does, or if one is wholly inside the other. The depth is the maximum translation that one triangle, or
+//! one corner, needs to be free: so it is never more than the links need. The work of one comparison is bounded.
 
 use super::convex::Convex;
 use super::overlap::{Meeting, meeting};
@@ -15,13 +15,13 @@ use ratn_model::pose::Pose;
 use ratn_motion::mesh::Meshed;
 use ratn_motion::robot::to_f32;
 
-/// Triangles that are looked at in one look, at the most, those of two meshes in pairs. What is found by then counts.
+/// Maximum number of triangles of one comparison, or of pairs of triangles for two meshes. What is found by then counts.
 const MAX_PAIRS: usize = 4_000;
 
-/// Corners of a mesh of which it is asked how deep they are in another one, at the most.
+/// Maximum number of corners of a mesh whose depth in another mesh is computed.
 const MAX_CORNERS: usize = 64;
 
-/// The boxes around triangles are in `f32`: by how much they are larger, in metres.
+/// Enlargement of the boxes around triangles, which are `f32`, in metres.
 const ROUNDED_M: f64 = 1e-5;
 
 /// A mesh, in the frame of its link.
@@ -29,7 +29,7 @@ const ROUNDED_M: f64 = 1e-5;
 pub(super) struct Surface {
     triangles: Vec<[Vector; 3]>,
     tree: Bvh,
-    /// The convex pieces that the engine has for it.
+    /// The convex pieces that the physics engine uses.
     hulls: Vec<SharedShape>,
 }
 
@@ -45,12 +45,12 @@ impl Surface {
         Surface { tree: Bvh::from_iter(BvhBuildStrategy::Binned, boxes), triangles, hulls }
     }
 
-    /// The convex pieces that the engine has for it, in the frame of the link.
+    /// The convex pieces that the physics engine uses, in the frame of the link.
     pub(super) fn hulls(&self) -> &[SharedShape] {
         &self.hulls
     }
 
-    /// The box around it in its place.
+    /// Its bounding box at a pose.
     pub(super) fn extent(&self, at: &Pose) -> Aabb {
         moved(&self.tree.root_aabb(), at)
     }
@@ -59,7 +59,7 @@ impl Surface {
         Convex::triangle(self.triangles[index as usize].map(|Vector(corner)| Vector(at.transform(corner))))
     }
 
-    /// How it meets something convex, if they are no farther apart than `within_m` metres, or, where that is below 0, at least so deep in each other.
+    /// Its contact with a convex shape, if they are no farther apart than `within_m` metres. A negative `within_m` is a minimum depth.
     pub(super) fn meeting(&self, at: Pose, other: &Convex, within_m: f64) -> Option<Meeting> {
         self.meeting_near(at, other, within_m.max(0.0)).filter(|met| met.depth_m >= -within_m)
     }
@@ -77,8 +77,8 @@ impl Surface {
         inside.or(found)
     }
 
-    /// The same of what is near by: the deepest that a triangle is in it. Triangles are looked at as deep as they may be at the most, until no other one may be
-    /// deeper than one that was found.
+    /// The contact of the deepest triangle near the shape. The triangles are checked in the order of an upper bound of their depth, until none can
+    /// be deeper than the deepest one found.
     fn nearest_triangle(&self, at: Pose, other: &Convex, within_m: f64, pairs: &mut usize) -> Option<Meeting> {
         let near = extent(other, &at, within_m.max(0.0));
         let ways: Vec<Vector> =
@@ -105,7 +105,7 @@ impl Surface {
         found
     }
 
-    /// How it meets another one, as [`Surface::meeting`].
+    /// Its contact with another mesh, as [`Surface::meeting`].
     pub(super) fn meeting_surface(&self, at: Pose, other: &Surface, its: Pose, within_m: f64) -> Option<Meeting> {
         self.meeting_near_surface(at, other, its, within_m.max(0.0)).filter(|met| met.depth_m >= -within_m)
     }
@@ -126,14 +126,14 @@ impl Surface {
             found = found.into_iter().chain(met).reduce(deeper);
         }
         let do_cross = found.is_some_and(|found| found.depth_m >= 0.0);
-        // Where no triangles meet, one corner says whether all are inside.
+        // If no triangles touch, one corner tells whether all are inside.
         let corners = |inside: bool| if do_cross { MAX_CORNERS } else { usize::from(inside) };
         let first = self.deepest_in(&at, other, &its, corners(other.tree.root_aabb().contains(&mine)));
         let second = other.deepest_in(&its, self, &at, corners(self.tree.root_aabb().contains(&theirs)));
         found.into_iter().chain(first).chain(second.map(Meeting::turned)).reduce(deeper)
     }
 
-    /// How deep the deepest of some of its corners is in another one.
+    /// The deepest contact among some of its corners in another mesh.
     fn deepest_in(&self, at: &Pose, other: &Surface, its: &Pose, most: usize) -> Option<Meeting> {
         if most == 0 {
             return None;
@@ -149,7 +149,7 @@ impl Surface {
         some.filter(|corner| other.holds(**corner)).map(|corner| other.depth_of(*corner, its)).reduce(deeper)
     }
 
-    /// How a point of something else that is inside, in the frame of the link, meets the surface: the point comes first.
+    /// The contact of an inner point, in the frame of the link, with the surface; the point is the first of the two.
     fn depth_of(&self, point: Vector, at: &Pose) -> Meeting {
         let aside = narrow(point);
         let near = self.tree.find_best(
@@ -166,8 +166,7 @@ impl Surface {
         }
     }
 
-    /// Whether a point is inside, in the frame of the link: a straight line upwards from there leaves the surface more often than it enters it, or the other
-    /// way round.
+    /// Whether a point, in the frame of the link, is inside: a ray upwards from it does not leave the surface as often as it enters it.
     fn holds(&self, point: Vector) -> bool {
         let (from, room) = (narrow(point), self.tree.root_aabb());
         let top = Vector32::new(from.x, from.y, room.maxs.z.max(from.z));
@@ -176,10 +175,10 @@ impl Surface {
     }
 }
 
-/// Whether a straight line upwards from a point crosses a triangle: 1 from below, -1 from above. A line along a common edge crosses one of two triangles.
+/// Whether a ray upwards from a point crosses a triangle: 1 from below, -1 from above. A ray along a common edge crosses one of two triangles.
 fn crossed(triangle: &[Vector; 3], Vector([x, y, z]): Vector) -> i32 {
     let edges = [[0, 1], [1, 2], [2, 0]].map(|edge| edge.map(|corner: usize| triangle[corner].0));
-    // An edge counts where one of its ends is beyond y and the other is not.
+    // An edge counts if exactly one of its ends is beyond y.
     let beyond = |[a, b]: &[[f64; 3]; 2]| {
         let (a, b) = if a[1] <= b[1] { (a, b) } else { (b, a) };
         a[1] <= y && y < b[1] && x < a[0] + (b[0] - a[0]) * ((y - a[1]) / (b[1] - a[1]))
@@ -189,12 +188,12 @@ fn crossed(triangle: &[Vector; 3], Vector([x, y, z]): Vector) -> i32 {
     }
     let across = (triangle[1] - triangle[0]).cross(triangle[2] - triangle[0]).0;
     let Vector([a, b, c]) = triangle[0];
-    // The height of the plane there.
+    // The height of the triangle's plane there.
     let height = c - (across[0] * (x - a) + across[1] * (y - b)) / across[2];
     if across[2] == 0.0 || height < z { 0 } else { across[2].signum() as i32 }
 }
 
-/// How deep two shapes are in each other at the most: no deeper than along any of these directions, nor from middle to middle.
+/// Upper bound of the depth of two shapes: their overlap along any of these directions, or from middle to middle.
 fn deepest_along(ways: &[Vector], a: &Convex, b: &Convex) -> f64 {
     let between = (b.middle - a.middle).direction();
     let overlap = |way: &Vector| (a.farthest(*way) - b.farthest(-*way)).dot(*way) + a.radius + b.radius;
@@ -209,17 +208,17 @@ fn narrow(Vector(v): Vector) -> Vector32 {
     Vector32::from_array(v.map(|c| c as f32))
 }
 
-/// The box around points.
+/// The bounding box of points, `more_m` metres larger.
 fn around(points: &[Vector], more_m: f64) -> Aabb {
     Aabb::from_points(points.iter().map(|point| narrow(*point))).loosened((more_m + ROUNDED_M) as f32)
 }
 
-/// A box as seen from another frame, by its pose there, with a box around it.
+/// The bounding box of a box in another frame, given its pose there.
 fn moved(aabb: &Aabb, pose: &Pose) -> Aabb {
     aabb.transform_by(&to_f32(pose)).loosened(ROUNDED_M as f32)
 }
 
-/// The box in a frame that holds something convex and `more_m` metres around it.
+/// The bounding box of a convex shape in a frame, `more_m` metres larger.
 fn extent(convex: &Convex, frame: &Pose, more_m: f64) -> Aabb {
     let reach = |way: Vector| {
         let along = Vector(frame.rotate(way.0));
@@ -230,7 +229,7 @@ fn extent(convex: &Convex, frame: &Pose, more_m: f64) -> Aabb {
     around(&[least, most], more_m)
 }
 
-/// The point of a triangle that is nearest to another.
+/// The nearest point of a triangle to another point.
 fn nearest(triangle: &[Vector; 3], to: Vector) -> Vector {
     let [a, b, c] = *triangle;
     let edges = [[a, b], [b, c], [c, a]];

@@ -1,16 +1,15 @@
-//! What touches what: every pair of bodies, the robot's links among each other and against furniture included.
+//! Contacts of every pair of bodies, including the robot's links with each other and with furniture.
 //!
-//! The bodies are those that the physics moves, where it has put them. How deep they are in each other is the judge's own answer (`overlap`): that of
-//! the engine is off by up to centimetres where cylinders and capsules are deep in each other, and by millimetres where they hardly touch. Nothing of a
-//! planner is asked. Two kinds of pairs are left out: those of which neither is a link or is carried, because the
-//! robot does not decide what objects do to each other; and those that the robot is built to have in contact: links that hang on each
-//! other, what touches in its home posture (a capsule's end reaches into the next link, the base stands on the floor), and links between
-//! which a single joint decides (the flange and the link before the wrist): its limits keep them apart, not who plans. A link with meshes is looked at by
-//! its primitives and by the meshes as they are (`shell`), not by the convex pieces that the engine has for them.
+//! The bodies are those of the physics engine, where it has moved them. Their depth is computed by the judge itself (`overlap`): the engine's is
+//! off by up to centimetres if cylinders and capsules are deep in each other, and by millimetres if they hardly touch. No planner is asked. Two
+//! kinds of pairs are left out: those without a link or a carried object, because the robot does not decide what objects do to each other; and
+//! those that the robot is built to have in contact: a link and its parent, links that touch in the home posture (a capsule's end reaches into the
+//! next link, the base stands on the floor), and links with only a single joint between them that decides (the flange and the link before the
+//! wrist): the limits of that joint keep them apart, not the planner. A link with meshes is checked by its primitives and by the meshes as they
+//! are (`shell`), not by the convex pieces that the engine uses.
 //!
-//! Each step looks: first whether the boxes around links, pieces of furniture and objects meet, then, of two that do, at those of their parts that are in the
-//! other's box.
-//! What is shared with the planner: the reader of the robot's description and its forward kinematics.
+//! Each step first checks the bounding boxes of links, pieces of furniture and objects (broad phase), then, for two that meet, the parts of each
+//! that are in the other's box. Shared with the planner are only the reader of the robot's description and its forward kinematics.
 
 use super::convex::Convex;
 use super::overlap::{Meeting, meeting};
@@ -39,51 +38,51 @@ pub enum Thing {
     Object(usize),
 }
 
-/// Two bodies that touch, or are about to.
+/// A contact of two bodies, or a distance below `NEAR_M`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Touch {
-    /// Which; links before furniture before objects.
+    /// The two bodies: links before furniture before objects.
     pub things: [Thing; 2],
-    /// How deep they are in each other, in metres; negative: how far apart, at most [`NEAR_M`].
+    /// Penetration depth in metres; negative: the distance, at most [`NEAR_M`].
     pub depth_m: f64,
-    /// Where, in the world frame.
+    /// The point of contact, in the world frame.
     pub at: [f64; 3],
-    /// From the first to the second, where the first is pushed out: a unit vector of the world frame.
+    /// Unit vector from the first to the second, in the world frame; the first is pushed out against it.
     pub normal: [f64; 3],
-    /// How fast one moved as seen from the other there before they touched, in metres per second.
+    /// Relative speed of the two at the point before they touched, in metres per second.
     pub speed_m_s: f64,
 }
 
-/// What is nearer than this is looked at, in metres.
+/// Maximum distance that is reported, in metres.
 pub const NEAR_M: f64 = 5e-4;
 
-/// What counts as on an axis, in metres and as a sine.
+/// Tolerance for being on an axis, in metres and as a sine.
 const ALIGNED: f64 = 1e-9;
 
-/// By how much more than [`NEAR_M`] the box around a link is larger, in metres: where bodies are is rounded otherwise than where their link is.
+/// Enlargement of a link's bounding box beyond [`NEAR_M`], in metres: the poses of bodies are rounded differently from those of their links.
 const ROUNDED_M: f32 = 1e-4;
 
-/// Which links are looked at together, by their indices in [`Robot::model`], and which stand on the floor.
+/// The pairs of links that are checked, by their indices in [`Robot::model`], and the links that stand on the floor.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Joined {
-    /// Pairs of links with shapes, the lower index first, but those that are made to touch.
+    /// Pairs of links with shapes, the lower index first, without those that are built to touch.
     apart: Vec<[usize; 2]>,
     on_floor: BTreeSet<usize>,
-    /// The box around all shapes of each link that has some, in its own frame.
+    /// The bounding box of all shapes of each link that has any, in its own frame.
     boxes: BTreeMap<usize, Aabb>,
-    /// The meshes of each link that has some.
+    /// The meshes of each link that has any.
     surfaces: BTreeMap<usize, Vec<Surface>>,
 }
 
 impl Joined {
-    /// Links that hang on each other, and what touches in the home posture.
+    /// Leaves out links that are attached to each other, and pairs that touch in the home posture.
     pub(super) fn of(robot: &Robot) -> Joined {
         let home = Configuration {
             arm: robot.posture(HOME).unwrap_or_else(|| robot.at_zero().arm),
             finger: robot.open_finger_m(),
             ..robot.at_zero()
         };
-        // The other arms are in their postures `home` with open fingers, where the robot has them.
+        // The other arms are in their `home` postures with open fingers, if the robot defines them.
         let poses = robot.poses(&home);
         let mut joined = Joined { boxes: boxes(robot), ..Joined::default() };
         for (index, link) in robot.model.links.iter().enumerate().filter(|(_, link)| !link.meshes.is_empty()) {
@@ -110,7 +109,7 @@ impl Joined {
         self.surfaces.get(&link).map_or(&[], |surfaces| surfaces)
     }
 
-    /// The shapes of a link in its place.
+    /// The shapes of a link at a pose.
     fn shaped(&self, robot: &Robot, link: usize, pose: &Pose) -> Vec<Shaped<'_>> {
         let primitives = robot.model.links[link].own_bodies().iter().map(|body| {
             let (shape, place) = (body.geometry.shape(0.0), to_f32(&pose.compose(&body.pose)));
@@ -122,22 +121,22 @@ impl Joined {
     }
 }
 
-/// A shape in its place.
+/// A shape with its pose.
 #[derive(Clone, Copy)]
 enum Form<'s> {
     Convex(Convex),
-    /// A mesh of a link that is there.
+    /// A mesh of a link, with the link's pose.
     Surface(&'s Surface, Pose),
 }
 
-/// The same, with the box around it.
+/// The same with its bounding box.
 struct Shaped<'s> {
     form: Form<'s>,
     aabb: Aabb,
 }
 
 impl Form<'_> {
-    /// How it meets another shape, if they are no farther apart than `within_m` metres, or, where that is below 0, at least so deep in each other.
+    /// Its contact with another shape, if they are no farther apart than `within_m` metres. A negative `within_m` is a minimum depth.
     fn meeting(&self, other: &Form<'_>, within_m: f64) -> Option<Meeting> {
         match (self, other) {
             (Form::Convex(a), Form::Convex(b)) => meeting(a, b, within_m),
@@ -155,13 +154,14 @@ fn do_meet(of_a: &[Shaped<'_>], of_b: &[Shaped<'_>]) -> bool {
     pairs.any(|(a, b)| a.aabb.loosened(NEAR_M as f32).intersects(&b.aabb) && touch(a, b))
 }
 
-/// Whether a link is made to touch one before it: it hangs on that, or its joint only turns it about itself and the link between hangs on that.
+/// Whether a link is built to touch one before it: its parent, or its grandparent if its joint only turns it in place (links without shapes are
+/// skipped).
 fn hangs(robot: &Robot, on: usize, link: usize) -> bool {
     let next = above(robot, link).filter(|_| turns_in_itself(robot, link)).and_then(|between| above(robot, between));
     above(robot, link) == Some(on) || next == Some(on)
 }
 
-/// The box around the shapes of each link that has some, in its own frame.
+/// The bounding box of the shapes of each link that has any, in its own frame.
 fn boxes(robot: &Robot) -> BTreeMap<usize, Aabb> {
     let around = |link: &Link| {
         let primitives = link.own_bodies().iter();
@@ -172,13 +172,13 @@ fn boxes(robot: &Robot) -> BTreeMap<usize, Aabb> {
     robot.model.links.iter().enumerate().filter_map(|(i, link)| Some((i, around(link)?))).collect()
 }
 
-/// The next link with a shape above another.
+/// The first link with a shape from a link towards the root.
 fn above(robot: &Robot, link: usize) -> Option<usize> {
     let mut parents = std::iter::successors(robot.model.links[link].parent, |parent| robot.model.links[*parent].parent);
     parents.find(|parent| !robot.model.links[*parent].bodies.is_empty())
 }
 
-/// Whether the joint of a link only turns it about its own axis: seen from elsewhere, it is where it was.
+/// Whether the joint of a link only turns it about its own axis of symmetry, so that its shape stays in place.
 fn turns_in_itself(robot: &Robot, link: usize) -> bool {
     let Some(Drive { axis, slides: false, .. }) = robot.model.links[link].drive else { return false };
     let off = |v: [f64; 3]| {
@@ -198,7 +198,7 @@ fn turns_in_itself(robot: &Robot, link: usize) -> bool {
     link.meshes.is_empty() && link.own_bodies().iter().all(is_round)
 }
 
-/// How a body moves.
+/// The velocity of a body.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Speed {
     middle: Vector,
@@ -207,7 +207,7 @@ pub(super) struct Speed {
 }
 
 impl Speed {
-    /// Of a body, now.
+    /// The present velocity of a body.
     pub(super) fn of(body: &RigidBody) -> Speed {
         Speed { middle: body.center_of_mass(), along: body.linvel(), about: body.angvel() }
     }
@@ -217,7 +217,7 @@ impl Speed {
     }
 }
 
-/// What is a link, a piece of furniture or an object.
+/// A link, a piece of furniture or an object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Of<'a> {
     Link(usize),
@@ -225,11 +225,11 @@ enum Of<'a> {
     Object(usize),
 }
 
-/// The parts of one thing, placed when they are asked for.
+/// The parts of one thing, computed when first needed.
 struct Group<'a> {
     environment: &'a Environment,
     of: Of<'a>,
-    /// Holds all of them and what is near.
+    /// Bounding box of all parts, with a margin.
     room: Aabb,
     parts: OnceCell<Parts<'a>>,
 }
@@ -246,21 +246,21 @@ struct Groups<'a> {
     objects: Vec<Group<'a>>,
 }
 
-/// Two colliders that may touch: each is in the box around the thing that the other belongs to.
+/// Two colliders that may touch: each is in the bounding box of the thing that the other belongs to.
 struct Candidate<'g, 'a> {
     of: [Of<'a>; 2],
     parts: [&'g Part<'a>; 2],
 }
 
 impl<'a> Group<'a> {
-    /// A link, by the box that moves with it.
+    /// A link, with the bounding box that moves with it.
     fn link(environment: &'a Environment, link: usize) -> Option<Group<'a>> {
         let own = environment.joined().boxes.get(&link)?;
         let room = own.transform_by(&to_f32(&environment.link_pose(link))).loosened(NEAR_M as f32 + ROUNDED_M);
         Some(Group { environment, of: Of::Link(link), room, parts: OnceCell::new() })
     }
 
-    /// Something of few shapes.
+    /// A thing with few shapes.
     fn placed(environment: &'a Environment, of: Of<'a>, colliders: Vec<ColliderHandle>) -> Option<Group<'a>> {
         let all = colliders.into_iter().map(|collider| environment.part(collider)).collect();
         let parts = Parts::of(all)?;
@@ -276,7 +276,7 @@ impl<'a> Group<'a> {
         Some(self.parts.get_or_init(|| parts))
     }
 
-    /// The pairs of a part of this and one of the other that may touch, in the order of the parts.
+    /// The pairs of a part of this thing and one of the other that may touch, in the order of the parts.
     fn pairs<'g>(&'g self, other: &'g Group<'a>) -> impl Iterator<Item = [&'g Part<'a>; 2]> {
         let do_meet = |a: &Aabb, b: &Aabb| a.intersects(b);
         let near = do_meet(&self.room, &other.room).then(|| Some([self.parts()?, other.parts()?])).flatten();
@@ -297,7 +297,7 @@ impl<'a> Parts<'a> {
     }
 }
 
-/// Colliders that come one after another of what is the same thing.
+/// Groups consecutive colliders of the same thing.
 fn grouped<K: PartialEq>(colliders: impl Iterator<Item = (K, ColliderHandle)>) -> Vec<(K, Vec<ColliderHandle>)> {
     let mut groups: Vec<(K, Vec<ColliderHandle>)> = Vec::new();
     for (of, collider) in colliders {
@@ -309,14 +309,14 @@ fn grouped<K: PartialEq>(colliders: impl Iterator<Item = (K, ColliderHandle)>) -
     groups
 }
 
-/// A shape as one of the pair.
+/// A shape of a thing.
 struct Part<'a> {
     form: Form<'a>,
     speed: Speed,
     aabb: Aabb,
 }
 
-/// A shape of a body in its place.
+/// A shape of a body at its pose.
 fn convex(shape: &dyn Shape, place: &Pose32) -> Convex {
     #[expect(
         clippy::expect_used,
@@ -326,14 +326,14 @@ fn convex(shape: &dyn Shape, place: &Pose32) -> Convex {
 }
 
 impl Environment {
-    /// What touches what, after the last step: all pairs of a link, or of a carried object, with anything else, but those that the robot
-    /// is built to have in contact. Of two bodies the deepest place.
+    /// All contacts after the last step: of links and carried objects with anything else, without the pairs that the robot is built to have in
+    /// contact. Of two bodies only the deepest contact.
     pub fn touches(&self) -> Vec<Touch> {
         let groups = self.groups();
         let mut found: Vec<Touch> = Vec::new();
         let mut deepest_yet: Option<([Of<'_>; 2], f64)> = None;
         for Candidate { of, parts: [a, b] } in self.candidates(&groups) {
-            // Of two things the deepest place counts: what is less deep than another one of them need not be known.
+            // Only the deepest contact of two things counts: a contact less deep than one already found need not be computed.
             let within_m = deepest_yet.filter(|(of_it, _)| *of_it == of).map_or(NEAR_M, |(_, depth_m)| -depth_m);
             let Some(touch) = a.aabb.intersects(&b.aabb).then(|| touch(a, b, within_m)).flatten() else { continue };
             deepest_yet = Some((of, touch.depth_m));
@@ -350,7 +350,7 @@ impl Environment {
         }
     }
 
-    /// All that can touch, where it is after the last step.
+    /// All things that can touch, after the last step.
     fn groups(&self) -> Groups<'_> {
         let links = self.joined().boxes.keys().filter_map(|link| Some((*link, Group::link(self, *link)?))).collect();
         let fixed = grouped(self.fixed_colliders()).into_iter();
@@ -359,10 +359,10 @@ impl Environment {
         Groups { links, fixed, objects: (0..self.len()).filter_map(object).collect() }
     }
 
-    /// The pairs of colliders that have to be looked at.
+    /// The pairs of colliders that have to be checked.
     fn candidates<'g, 'a>(&'a self, groups: &'g Groups<'a>) -> Vec<Candidate<'g, 'a>> {
         let mut found = Vec::new();
-        // The parts of the first are gone through one by one; `turned` names the second before it.
+        // Iterates over the parts of the first thing; with `turned` the second thing is the first of each pair.
         let mut look = |first: &'g Group<'a>, second: &'g Group<'a>, turned: bool| {
             let candidate = |[a, b]: [&'g Part<'a>; 2]| match turned {
                 true => Candidate { of: [second.of, first.of], parts: [b, a] },
@@ -390,7 +390,7 @@ impl Environment {
         found
     }
 
-    /// What an object stands on: all that touches it from below.
+    /// The supports of an object: everything that touches it from below.
     pub fn supports_of(&self, object: usize) -> Vec<Thing> {
         let mine: Vec<Part<'_>> = self.object_colliders(object).map(|c| self.part(c)).collect();
         let all = self.links_beside().chain(self.fixed_beside()).chain(self.objects_beside(object));
@@ -400,7 +400,7 @@ impl Environment {
         found
     }
 
-    /// On what an object rests: the deepest level contact. `None` in the air.
+    /// The support of an object: the deepest level contact. `None` in the air.
     pub fn rests_on(&self, object: usize) -> Option<Support<'_>> {
         let mine: Vec<Part<'_>> = self.object_colliders(object).map(|c| self.part(c)).collect();
         let mut best: Option<(f64, Of<'_>)> = None;
@@ -424,12 +424,12 @@ impl Environment {
         links.flat_map(|link| self.link_parts(*link).into_iter().map(|part| (Of::Link(*link), part)))
     }
 
-    /// Those of floor and furniture.
+    /// The parts of floor and furniture.
     fn fixed_beside(&self) -> impl Iterator<Item = (Of<'_>, Part<'_>)> {
         self.fixed_colliders().map(|(name, collider)| (Of::Fixed(name), self.part(collider)))
     }
 
-    /// Those of all objects but one.
+    /// The parts of all objects but one.
     fn objects_beside(&self, object: usize) -> impl Iterator<Item = (Of<'_>, Part<'_>)> {
         let others = (0..self.len()).filter(move |other| *other != object);
         others.flat_map(move |other| self.object_colliders(other).map(move |c| (Of::Object(other), self.part(c))))
@@ -449,7 +449,7 @@ impl Environment {
 
     fn part(&self, collider: ColliderHandle) -> Part<'_> {
         let (collider, body, place) = self.placed(collider);
-        // What the step did to an object is what the contact did to it.
+        // The step has already applied the contact to an object, so its velocity before the step counts.
         let of_it = |(body, _): &&(RigidBodyHandle, Speed)| collider.parent() == Some(*body);
         let before = self.speeds_before.iter().find(of_it).map(|(_, speed)| *speed);
         let speed = before.or(body.map(Speed::of)).unwrap_or_default();
@@ -458,18 +458,18 @@ impl Environment {
     }
 }
 
-/// How deep something that is above is in what bears it; `None` where it does not.
+/// Depth of a thing in the support below it; `None` if the support does not bear it.
 fn bears(below: &Part<'_>, above: &Part<'_>) -> Option<f64> {
     let met = below.form.meeting(&above.form, TOUCH_M)?;
     (met.normal.0[2] >= LEVEL).then_some(met.depth_m)
 }
 
-/// Where two parts touch, if they are no farther apart than `within_m` metres, or, where that is below 0, at least so deep in each other.
+/// The contact of two parts, if they are no farther apart than `within_m` metres. A negative `within_m` is a minimum depth.
 fn touch(a: &Part<'_>, b: &Part<'_>, within_m: f64) -> Option<Touch> {
     Some(touched(&a.form.meeting(&b.form, within_m)?, [a.speed, b.speed]))
 }
 
-/// The same of what moves so.
+/// The contact of two bodies that meet so, with these velocities.
 fn touched(met: &Meeting, speeds: [Speed; 2]) -> Touch {
     let at = Vector::from_array(met.at.0.map(|c| c as f32));
     let [va, vb] = speeds.map(|speed| speed.at(at));
@@ -482,7 +482,7 @@ fn touched(met: &Meeting, speeds: [Speed; 2]) -> Touch {
     }
 }
 
-/// One touch of each two things.
+/// Keeps the deepest contact of each two things.
 fn deepest(mut found: Vec<Touch>) -> Vec<Touch> {
     found.sort_by(|a, b| a.things.cmp(&b.things).then(b.depth_m.total_cmp(&a.depth_m)));
     found.dedup_by(|later, first| later.things == first.things);
@@ -496,10 +496,10 @@ mod tests {
     use ratn_motion::description::RobotDescription;
     use ratn_motion::joint_vector::JointVector;
 
-    /// Links of an arm that are cubes.
+    /// Number of links of an arm made of cubes.
     const CUBES: usize = 6;
 
-    /// An arm of cubes, which are meshes, one 0.2 m beyond the other; each turns about the upright.
+    /// An arm of cubes, which are meshes, each 0.2 m beyond the one before; each turns about the vertical axis.
     fn cubes() -> Robot {
         let corner = |i: usize| [0, 1, 2].map(|axis| if i >> axis & 1 == 0 { -0.05 } else { 0.05 });
         let faces = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
@@ -543,7 +543,7 @@ mod tests {
             (pairs, placed, environment.touches())
         };
         assert_eq!(look([0.0; CUBES]), (0, 0, Vec::new()));
-        // The third cube turns the rest back: the fourth comes beside the second, the others beyond are free.
+        // The third cube turns the rest back: the fourth is beside the second, the others beyond are free.
         let (pairs, placed, touches) = look([0.0, 0.0, 2.6, 0.0, -1.5, 0.0]);
         assert!(touches.iter().any(|touch| touch.depth_m > 0.0), "{touches:?}");
         assert!(pairs > 0 && pairs < CUBES * (CUBES - 1) / 4, "{pairs} pairs of cubes");

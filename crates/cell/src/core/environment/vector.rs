@@ -1,4 +1,4 @@
-//! Vectors of three numbers in `f64`, for the judge: the engine's are in `f32`.
+//! Vectors of three `f64`, for the judge: the physics engine's are `f32`.
 
 use std::iter::Sum;
 use std::ops::{Add, Mul, Neg, Sub};
@@ -25,28 +25,28 @@ impl Vector {
         self.dot(self).sqrt()
     }
 
-    /// Of length 1; `None` of what has no length.
+    /// The unit vector of this direction; `None` for a vector without length.
     pub(super) fn direction(self) -> Option<Vector> {
         let length = self.length();
         (length > SHORTEST).then(|| self * (1.0 / length))
     }
 
-    /// What is left of it beside a direction of length 1.
+    /// The part of it that is perpendicular to a unit vector.
     pub(super) fn beside(self, way: Vector) -> Vector {
         self - way * self.dot(way)
     }
 
-    /// Two directions, across this one of length 1 and across each other; the three are right-handed.
+    /// Two unit vectors that are perpendicular to this unit vector and to each other; the three are right-handed.
     pub(super) fn across(self) -> [Vector; 2] {
         let least = |i: &usize, j: &usize| self.0[*i].abs().total_cmp(&self.0[*j].abs());
         let axis = Vector::AXES[(0..3).min_by(least).unwrap_or_default()];
-        // The axis that it is farthest from makes an angle of 54° with it at the least.
+        // The axis that is farthest from it has an angle of at least 54° with it.
         let first = axis.beside(self).direction().unwrap_or(axis);
         [first, self.cross(first)]
     }
 }
 
-/// What is shorter has no direction.
+/// A shorter vector has no direction.
 const SHORTEST: f64 = 1e-12;
 
 impl Add for Vector {

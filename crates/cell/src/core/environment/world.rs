@@ -1,4 +1,4 @@
-//! The bodies and their steps.
+//! The rigid bodies and the simulation step.
 
 use super::object::{Kind, Model};
 use super::riding::Riding;
@@ -20,59 +20,59 @@ use std::time::Duration;
 pub const STEP: Duration = Duration::from_millis(4);
 /// The floor's name.
 pub const FLOOR: &str = "floor";
-/// The floor, in metres; its top is at z = 0.
+/// Size of the floor, in metres; its top is at z = 0.
 const FLOOR_SIZE: [f64; 3] = [12.0, 12.0, 0.1];
-/// m/s².
+/// Gravity, in m/s².
 pub const GRAVITY: f64 = 9.81;
-/// The size of what rapier's tolerances are made for: it lets bodies sink into each other by 0.5 % of it and pushes them apart with
-/// at most three of it a second.
+/// Typical size of an object, which rapier scales its tolerances by: bodies may penetrate each other by 0.5 % of it and are pushed apart with at
+/// most three times it per second.
 const LENGTH_UNIT_M: f32 = 0.1;
-/// What moves slower than a twentieth of the length unit a second for so long stands still.
+/// A body slower than a twentieth of the length unit per second for this time stands still, in seconds.
 const STILL_S: f32 = 0.3;
-/// How near something must be to what it rests on, in metres.
+/// Maximum distance of an object from its support, in metres.
 pub(super) const TOUCH_M: f64 = 0.003;
-/// How steep a support may be: the least upward part of its normal.
+/// Minimum upward component of a support's normal.
 pub(super) const LEVEL: f64 = 0.7;
-/// What fell out of the world is not followed any farther, in metres below the floor.
+/// Objects below this height have fallen out of the world and are not simulated any more, in metres.
 pub(super) const LOST_M: f32 = -5.0;
-/// How much fingers and links rub.
+/// Friction coefficient of fingers and links.
 pub(super) const ROBOT_FRICTION: f32 = 0.6;
 
-/// What a link is that moves.
+/// The body type of a moving link.
 const LINK: RigidBodyType = RigidBodyType::KinematicPositionBased;
 
 const OF_ROBOT: Group = Group::GROUP_1;
 const OF_OBJECTS: Group = Group::GROUP_2;
 const OF_FURNITURE: Group = Group::GROUP_3;
 
-/// Something that never moves, made of boxes.
+/// A piece of furniture that never moves, made of boxes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Furniture {
     /// Its name.
     pub name: String,
-    /// Centres, in the world frame, and edges in metres.
+    /// Centres, in the world frame, and edges, in metres.
     pub parts: Vec<(Pose, [f64; 3])>,
 }
 
-/// Where an object is and how it moves.
+/// Pose and velocity of an object.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ObjectState {
-    /// Its frame, in the world frame.
+    /// Its pose in the world frame.
     pub pose: Pose,
-    /// Metres per second.
+    /// Velocity in metres per second.
     pub velocity: [f64; 3],
-    /// Radians per second.
+    /// Angular velocity in radians per second.
     pub spin: [f64; 3],
-    /// It has stood still for a while.
+    /// Whether it has stood still for a while.
     pub at_rest: bool,
-    /// It goes where it is put, [`Environment::carry`].
+    /// Whether it is carried ([`Environment::carry`]).
     pub carried: bool,
-    /// It goes where the base goes: where it is as seen from there.
+    /// Its pose in the frame of the base, if it rides on the base.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rides: Option<Pose>,
 }
 
-/// What an environment can be made of again: see [`Environment::save`].
+/// What an environment can be restored from: see [`Environment::save`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Saved {
     /// Steps since the beginning.
@@ -81,7 +81,7 @@ pub struct Saved {
     pub objects: Vec<(Model, ObjectState)>,
 }
 
-/// Rigid bodies in a cell.
+/// The rigid bodies of a cell.
 pub struct Environment {
     gravity: Vector,
     parameters: IntegrationParameters,
@@ -97,21 +97,21 @@ pub struct Environment {
     ccd: CCDSolver,
     steps: u64,
     furniture: Vec<Furniture>,
-    /// Floor and furniture: collider and name.
+    /// Colliders and names of floor and furniture.
     standing: Vec<(ColliderHandle, String)>,
     links: Vec<RobotBody>,
-    /// Where the robot's base was at the last step.
+    /// Position of the robot's base at the last step.
     pub(super) base: [f64; 3],
-    /// Of each gripper, by the number of its arm: whether its fingers push what they meet.
+    /// Per arm: whether the fingers of its gripper push what they touch.
     fingers_solid: Vec<bool>,
     objects: Vec<Body>,
     pub(super) riding: Riding,
-    /// Where the robot's links came to in the last step.
+    /// Poses of the robot's links after the last step.
     link_poses: Vec<Pose>,
-    /// Their names, and which of them are made to touch.
+    /// Their names, and the pairs that are built to touch.
     link_names: Vec<String>,
     joined: Joined,
-    /// How what is left to itself moved before the last step.
+    /// Velocities before the last step of the bodies that move freely.
     pub(super) speeds_before: Vec<(RigidBodyHandle, Speed)>,
 }
 
@@ -120,15 +120,15 @@ pub struct Environment {
 struct RobotBody {
     body: RigidBodyHandle,
     colliders: Vec<ColliderHandle>,
-    /// It is a mesh: the judge has that itself.
+    /// Whether it is a mesh: the judge has its own copy.
     is_mesh: bool,
-    /// It is a finger of the arm of this number.
+    /// The arm whose finger it is.
     finger_of: Option<usize>,
     link: usize,
-    /// As seen from its link.
+    /// Its pose in the frame of its link.
     pose: Pose,
     at: Pose32,
-    /// It did not move in the last step.
+    /// Whether it did not move in the last step.
     stands: bool,
 }
 
@@ -140,7 +140,7 @@ struct Body {
 }
 
 impl Environment {
-    /// Furniture, a robot, and objects that stand still until something touches them.
+    /// Furniture, a robot, and objects that sleep until something touches them.
     pub fn new(
         robot: &Robot,
         configuration: &Configuration,
@@ -159,7 +159,7 @@ impl Environment {
         Environment::restore(robot, configuration, furniture, &Saved { steps: 0, objects })
     }
 
-    /// The environment that was saved. What goes on from it does so as where it was saved, to the last bit.
+    /// Restores a saved environment. It continues as the saved one does, to the last bit.
     pub fn restore(
         robot: &Robot,
         configuration: &Configuration,
@@ -215,8 +215,8 @@ impl Environment {
         environment
     }
 
-    /// What it can be restored from. It is itself made again from that, so that both go on alike: what the solver remembers of
-    /// past contacts is not part of the state.
+    /// Saves the state for `restore`, and also remakes this environment from it, so that both continue alike: what the solver remembers of past
+    /// contacts is not part of the state.
     pub fn save(&mut self, robot: &Robot, configuration: &Configuration) -> Saved {
         let saved = self.saved();
         self.make_again(robot, configuration, &saved);
@@ -227,7 +227,7 @@ impl Environment {
         Saved { steps: self.steps, objects: self.states().collect() }
     }
 
-    /// What stands there becomes what was saved; nothing else of it changes.
+    /// Remakes the bodies from a saved state; nothing else changes.
     pub(super) fn make_again(&mut self, robot: &Robot, configuration: &Configuration, saved: &Saved) {
         let (solid, joined) = (std::mem::take(&mut self.fingers_solid), std::mem::take(&mut self.joined));
         *self = Environment::made(robot, configuration, &self.furniture, saved, joined);
@@ -249,31 +249,30 @@ impl Environment {
         !self.riding.is_under_way() && self.objects.iter().all(|o| !self.moves(&self.bodies[o.body]))
     }
 
-    /// Time goes on and nothing happens, up to the last step that is not after `until`: for when all is at rest.
+    /// Advances the time to the last step that is not after `until` without simulating: for when everything is at rest.
     pub fn skip_until(&mut self, until: Timestamp) {
         let steps = until.since(Timestamp::default()).as_nanos() / STEP.as_nanos();
         self.steps = self.steps.max(u64::try_from(steps).unwrap_or(u64::MAX));
     }
 
-    /// It is this late, whatever it was before.
+    /// Sets the time, whatever it was before.
     pub fn set_time(&mut self, now: Timestamp) {
         self.steps = 0;
         self.skip_until(now);
     }
 
-    /// One step, in which the robot's joints come to `configuration`.
+    /// One step, in which the robot's joints move to `configuration`.
     pub fn step(&mut self, robot: &Robot, configuration: &Configuration) {
         self.take_along(robot, configuration);
         let before = std::mem::replace(&mut self.base, configuration.base);
-        // A contact that is taken over from the step before has its points where the carrier was then: on a deck that turns, things
-        // would creep outwards.
+        // A contact recycled from the step before has its points where the carrier was then: on a turning deck, objects would creep outwards.
         self.parameters.contact_recycling = before == configuration.base;
         let poses = robot.poses(configuration);
         for link in &mut self.links {
             let (body, pose) = (&mut self.bodies[link.body], to_f32(&poses[link.link].compose(&link.pose)));
             let stands = link.at == pose;
             if stands != link.stands {
-                // A body that is put where it is has the speed that rounding gives it, and nothing on it would ever sleep.
+                // A body that is set to the pose that it has gets a velocity from rounding, and nothing on it would ever sleep.
                 body.set_body_type(if stands { RigidBodyType::Fixed } else { LINK }, !stands);
             }
             if !stands {
@@ -304,7 +303,7 @@ impl Environment {
         self.board(robot, configuration, before);
     }
 
-    /// Where an object is and how it moves.
+    /// Pose and velocity of an object.
     pub fn state(&self, object: usize) -> ObjectState {
         let (body, rides) = (self.body(object), self.riding.seat(object));
         ObjectState {
@@ -317,12 +316,12 @@ impl Environment {
         }
     }
 
-    /// What an object is.
+    /// The model of an object.
     pub fn model(&self, object: usize) -> &Model {
         &self.objects[object].model
     }
 
-    /// How many objects there are.
+    /// Number of objects.
     pub fn len(&self) -> usize {
         self.objects.len()
     }
@@ -332,7 +331,7 @@ impl Environment {
         self.objects.is_empty()
     }
 
-    /// An object goes where it is put from now on, and is at `pose` after the next step. What it meets it pushes.
+    /// Carries an object: from now on it is where it is put, and at `pose` after the next step. It pushes what it touches.
     pub fn carry(&mut self, object: usize, pose: &Pose) {
         self.alight(object);
         let body = &mut self.bodies[self.objects[object].body];
@@ -342,7 +341,7 @@ impl Environment {
         body.set_next_kinematic_position(to_f32(pose));
     }
 
-    /// An object is left to itself where it is, moving as it was told.
+    /// Releases an object at `pose` with a velocity; from now on it moves freely.
     pub fn let_go(&mut self, object: usize, pose: &Pose, velocity: [f64; 3]) {
         self.alight(object);
         let body = &mut self.bodies[self.objects[object].body];
@@ -352,11 +351,11 @@ impl Environment {
         body.set_angvel(Vector::ZERO, true);
     }
 
-    /// Something outside puts an object there; it is left to itself.
+    /// Puts an object at `pose` from outside the simulation; from now on it moves freely.
     pub fn put(&mut self, object: usize, pose: &Pose) {
         let was = to_f64(self.bodies[self.objects[object].body].position());
         self.let_go(object, pose, [0.0; 3]);
-        // What stood on it does not notice by itself.
+        // A sleeping object that stood on it does not wake by itself.
         let reach = self.objects.iter().map(|o| (o.body, self.bodies[o.body].translation()));
         let near: Vec<RigidBodyHandle> = reach
             .filter(|(_, at)| (*at - Vector::from_array(was.position.map(|c| c as f32))).length() < 4.0 * LENGTH_UNIT_M)
@@ -367,7 +366,7 @@ impl Environment {
         }
     }
 
-    /// Whether the fingers of an arm push what they meet. While they close they do not: `grip` decides what comes of that.
+    /// Sets whether the fingers of an arm push what they touch. While they close they do not: `grip` decides the result of closing.
     pub fn set_fingers_solid(&mut self, arm: usize, solid: bool) {
         match self.fingers_solid.get_mut(arm) {
             Some(known) if *known != solid => *known = solid,
@@ -384,17 +383,17 @@ impl Environment {
         &self.bodies[self.objects[object].body]
     }
 
-    /// The same, to be changed.
+    /// An object's body, mutable.
     pub(super) fn body_mut(&mut self, object: usize) -> &mut RigidBody {
         &mut self.bodies[self.objects[object].body]
     }
 
-    /// Whether something to stand on is a link of the robot.
+    /// Whether the support of this name is a link of the robot.
     pub(super) fn is_of_robot(&self, name: &str) -> bool {
         name != FLOOR && self.furniture.iter().all(|piece| piece.name != name)
     }
 
-    /// What all objects come to, and the time.
+    /// A digest of the state of all objects, and the time.
     pub fn digest(&self) -> Digest {
         let mut digester = Digester::default();
         digester.number(self.steps);
@@ -427,7 +426,7 @@ impl Environment {
         self.objects[object].parts.iter().copied()
     }
 
-    /// Where a link is.
+    /// The pose of a link.
     pub(super) fn link_pose(&self, link: usize) -> Pose {
         self.link_poses[link]
     }
@@ -442,18 +441,18 @@ impl Environment {
         &self.link_names[link]
     }
 
-    /// Which links are made to touch.
+    /// The pairs of links that are built to touch.
     pub(super) fn joined(&self) -> &Joined {
         &self.joined
     }
 
-    /// A collider, its body, and its place.
+    /// A collider with its body and pose.
     pub(super) fn placed(&self, collider: ColliderHandle) -> (&Collider, Option<&RigidBody>, Pose32) {
         let collider = &self.colliders[collider];
         (collider, collider.parent().map(|body| &self.bodies[body]), self.place(collider))
     }
 
-    /// A collider's place; its body's, since the last step, may be newer than its own.
+    /// The pose of a collider. After the last step its body's pose may be newer than its own.
     fn place(&self, collider: &Collider) -> Pose32 {
         let parent = collider.parent().map(|body| *self.bodies[body].position());
         parent.map_or(*collider.position(), |body| {
@@ -511,7 +510,7 @@ impl Environment {
             .pose(to_f32(&state.pose))
             .linvel(vector(state.velocity))
             .angvel(vector(state.spin))
-            // Thin things do not fall through thin boards.
+            // Thin objects do not fall through thin boards.
             .ccd_enabled(model.kind == Kind::Fork || model.kind == Kind::Plate)
             .sleeping(state.at_rest)
             .build();
@@ -534,16 +533,16 @@ impl Environment {
     }
 }
 
-/// What something rests on.
+/// The support of an object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Support<'a> {
-    /// The floor, a piece of furniture, a link of the robot.
+    /// The floor, a piece of furniture, or a link of the robot.
     Named(&'a str),
     /// Another object.
     Object(usize),
 }
 
-/// What rode when it was saved.
+/// The objects that rode when the state was saved.
 fn riders(saved: &Saved) -> Vec<(usize, Pose)> {
     let states = saved.objects.iter().enumerate();
     states.filter_map(|(i, (_, state))| state.rides.map(|seat| (i, seat))).collect()
