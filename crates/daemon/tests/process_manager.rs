@@ -214,7 +214,7 @@ async fn a_worker_that_hangs_is_taken_from_its_holder_killed_and_replaced() {
     kill(pid(&hung), Signal::SIGSTOP).unwrap();
     let of_lease = |event: &ResourceEvent| event.lease.is_some_and(|(id, _)| id == lease.id);
     let lost = watch.event(|event| event.kind == ResourceEventKind::Released && of_lease(event)).await;
-    assert_eq!((lost.resource.id.as_str(), lost.reason.as_str()), (hung.id.as_str(), "a resource of it is gone"));
+    assert_eq!((lost.resource.id.as_str(), lost.reason.as_str()), (hung.id.as_str(), "the resource is gone"));
     assert_eq!(watch.created("PathPlanner").await.id, "planner-2@compute");
     gone(pid(&hung)).await;
     processes.end().await;

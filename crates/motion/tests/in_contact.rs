@@ -146,6 +146,38 @@ fn a_departure_that_would_go_deeper_is_not_made_and_another_way_out_is() {
     validate_trajectory(&cell.robot, &cell.scene, &cell.state(), &plan.trajectory, Contact::None).unwrap();
 }
 
+/// A mat below the fingers, so thick that they are this deep in it.
+fn put_mat(cell: &mut Cell, deep_m: f64) {
+    let size = [0.2, 0.2, lowest_tip_m(cell) - aimm::TABLE_HEIGHT_M + deep_m];
+    let [x, y, _] = cell.robot.tool_pose(&cell.state()).position;
+    put(cell, "mat", size, Pose::from_rpy([x, y, aimm::TABLE_HEIGHT_M + size[2] / 2.0], 0.0, 0.0, 0.3));
+}
+
+#[test]
+fn a_departure_that_something_far_away_refuses_is_not_replaced_by_a_retreat() {
+    let mut cell = standing(0.001);
+    // As deep as every departure may begin.
+    put_mat(&mut cell, 0.003);
+    let wall = cell.robot.tool_pose(&cell.state()).compose(&Pose::at(0.0, 0.25, -0.1));
+    put(&mut cell, "wall", [0.2, 0.02, 0.3], Pose { quaternion_xyzw: wall.quaternion_xyzw, ..wall });
+    let depart = Straight { direction: [0.0, 1.0, 0.0], frame: Frame::Tool, length_m: 0.20 };
+    let goals = vec![Goal::Joints(aimm::OBSERVATION)];
+    let refused = cell.plan(&Request { depart, ..request(cell.state(), goals) }).unwrap_err();
+    assert!(matches!(refused, PlanError::Depart { .. }), "{refused}");
+}
+
+#[test]
+fn fingers_in_a_hollow_object_touch_nothing_that_a_retreat_leaves() {
+    let mut cell = standing(0.001);
+    put_mat(&mut cell, 0.02);
+    let goals = vec![Goal::Joints(aimm::OBSERVATION)];
+    let into = |reaches_into: Vec<String>| Request { reaches_into, ..request(cell.state(), goals.clone()) };
+    // What is not hollow is left by a retreat, which pushes it aside in the worst case.
+    cell.plan(&into(Vec::new())).unwrap();
+    let refused = cell.plan(&into(vec!["mat".to_owned()])).unwrap_err();
+    assert!(matches!(refused, PlanError::StartInCollision { .. }), "{refused}");
+}
+
 #[test]
 fn what_was_not_touched_at_the_start_is_not_touched_by_a_way_out() {
     let mut cell = standing(0.001);

@@ -17,7 +17,7 @@ use std::sync::Arc;
 impl Pool {
     /// Adds a resource, bound to a session if one is given. If a resource with the same id and owner exists, it is updated: its kind stays, its
     /// attributes and capacity are replaced (holders keep what they hold); if they are equal, nothing changes. A resource that a task has made gives
-    /// its id to a provider's resource: it is deleted, and its leases end.
+    /// its id to a provider's resource: it is deleted, and its holders lose it.
     ///
     /// # Errors
     /// An unknown session, the id of another owner's resource that does not give way, or a malformed or too large description.
@@ -79,7 +79,8 @@ impl Pool {
             && owner.is_some_and(Session::is_no_operators)
     }
 
-    /// Removes a resource. Every lease that holds units of it ends as a whole ([`EndReason::ResourceGone`]). `None` as session may delete anything.
+    /// Removes a resource. Holders hear [`crate::Change::ResourceLost`]; if it has a bound for standstill, their leases end as a whole
+    /// ([`EndReason::ResourceGone`]). `None` as session may delete anything.
     ///
     /// # Errors
     /// An unknown resource, or one that belongs to another session.
@@ -93,18 +94,19 @@ impl Pool {
         Ok(())
     }
 
-    /// Ends all leases of a resource, then deletes it.
+    /// Deletes a resource; what moves ends its leases first.
     fn remove(&mut self, slot: Slot, reason: EndReason) {
-        while let Some(lease) = self.lease_of(slot) {
+        while let Some(lease) = self.lease_that_ends_with(slot) {
             self.commit(Effect::LeaseEnded { lease, reason: EndReason::ResourceGone });
         }
         self.commit(Effect::ResourceDeleted { slot, reason });
     }
 
-    /// A live lease that holds units of a resource.
-    pub(crate) fn lease_of(&self, slot: Slot) -> Option<LeaseId> {
-        let holders = self.resources.get(slot)?.holders.iter();
-        holders.map(|(lease, _)| *lease).find(|lease| self.leases.contains_key(lease))
+    /// A live lease of a resource whose deletion ends the lease as a whole: one with a bound for standstill. Under such a lease something may
+    /// still move that relies on the deleted resource. Of other resources (a planner that died) the lease keeps the rest.
+    pub(crate) fn lease_that_ends_with(&self, slot: Slot) -> Option<LeaseId> {
+        let resource = self.resources.get(slot).filter(|resource| !resource.description.standstill().is_zero())?;
+        resource.holders.iter().map(|(lease, _)| *lease).find(|lease| self.leases.contains_key(lease))
     }
 
     /// Removes an amount, for good, from the free units of all resources that fit and that the session may delete by id ([`Pool::delete`]); a

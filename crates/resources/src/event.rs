@@ -66,8 +66,7 @@ pub enum Change {
         /// The reason.
         reason: EndReason,
     },
-    /// A resource was deleted while a lease held it, and the lease kept its other resources. Only records of earlier versions have this event:
-    /// now a lease ends before one of its resources is deleted.
+    /// A resource without a bound for standstill was deleted while a lease held it; the lease keeps its other resources.
     ResourceLost {
         /// The holder's lease.
         lease: LeaseId,

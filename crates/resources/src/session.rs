@@ -341,7 +341,7 @@ impl Pool {
                     false => (Effect::TaskEnded { session: id.clone() }, session.consumed.len()),
                 }
             } else if let Some(&slot) = session.provides.first() {
-                match self.lease_of(slot) {
+                match self.lease_that_ends_with(slot) {
                     Some(lease) => {
                         let held = self.leases.get(&lease).map_or(0, |record| record.held.len());
                         (Effect::LeaseEnded { lease, reason: EndReason::ResourceGone }, held)

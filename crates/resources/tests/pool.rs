@@ -246,9 +246,9 @@ fn a_session_without_keep_alive_loses_resources_leases_and_place_in_the_queue() 
     assert!(notices.contains(&Notice::Refused { waiter: waiting, refusal: Refusal::SessionEnded }));
     let changes = changes(&notices);
     assert!(matches!(&changes[..], [
-        Change::LeaseEnded { lease, reason: EndReason::ResourceGone, .. },
+        Change::ResourceLost { lease, resource: lost, .. },
         Change::ResourceDeleted { resource, reason: EndReason::SessionExpired },
-    ] if *lease == held.id && resource.id == "gripper"));
+    ] if *lease == held.id && lost.id == "gripper" && resource.id == "gripper"));
     assert!(bench.pool.get("gripper").is_none());
 }
 
@@ -513,19 +513,13 @@ fn exists_waits_for_the_resource_but_does_not_hold_it() {
 }
 
 #[test]
-fn a_lease_that_loses_a_resource_ends_as_a_whole() {
+fn a_deleted_resource_that_does_not_move_is_lost_to_its_holder_and_the_rest_of_the_lease_stays() {
     let mut bench = Bench::with(&[("Arm", 1), ("Gripper", 1)]);
     let lease = bench.granted("b", &[block("Arm"), block("Gripper")]);
-    let waiting = bench.acquire("a", &[block("Gripper")]);
     bench.pool.delete(bench.now, Some(&session("a")), "Arm-1").unwrap();
     let notices = bench.notices();
-    let ended = &changes(&notices)[0];
-    assert!(
-        matches!(ended, Change::LeaseEnded { lease: l, reason: EndReason::ResourceGone, .. } if *l == lease.id),
-        "{ended:?}"
-    );
-    assert_eq!(bench.pool.lease(lease.id), None);
-    assert_eq!(grants(&notices)[0].0, waiting, "nothing moves for a gripper without a bound");
+    assert!(matches!(changes(&notices)[0], Change::ResourceLost { lease: l, .. } if *l == lease.id));
+    assert_eq!(bench.pool.leases()[0].resources, ["Gripper-2"]);
     assert_eq!(
         bench.pool.delete(bench.now, Some(&session("b")), "Gripper-2").unwrap_err(),
         PoolError::NotYours { what: "resource `Gripper-2`".into(), owner: session("a"), caller: session("b") }

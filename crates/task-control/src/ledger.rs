@@ -197,15 +197,17 @@ impl Ledger {
             }
             Event::Woken => self.wakes = self.wakes.split_off(&Timestamp(at.0.saturating_add(1))),
             Event::Granted { instance, lease } => {
-                self.held.insert(lease.id);
-                // The run itself has handed the lease over.
+                // A lease that the run has handed over was held before.
+                let is_new = self.held.insert(lease.id) && self.went_back.iter().all(|one| one.lease != lease.id);
                 self.went_back.retain(|one| one.lease != lease.id);
                 let asked = self.waiting.remove(instance);
-                // A lease that was handed over may be older than others.
-                if let Some(asked) = asked.filter(|_| lease.id > self.youngest_lease) {
-                    self.youngest_lease = lease.id;
+                if let Some(asked) = asked.filter(|_| is_new) {
                     self.account.granted(&asked.requirements, lease);
-                    self.answered = vec![late_request(&asked.request), asked.request];
+                    // Grants may be heard in another order than they were made.
+                    if lease.id > self.youngest_lease {
+                        self.youngest_lease = lease.id;
+                        self.answered = vec![late_request(&asked.request), asked.request];
+                    }
                 }
             }
             Event::Refused { instance, .. } => {
@@ -486,6 +488,25 @@ mod tests {
         }
         let used_up = ledger.account.used_up().map(|(resource, one)| (resource, one.units.units()));
         assert_eq!(used_up.collect::<Vec<_>>(), [("battery", 2)]);
+    }
+
+    #[test]
+    fn what_grants_have_used_up_counts_in_whatever_order_they_are_heard() {
+        let mut ledger = Ledger::default();
+        let requirements = || vec![requirement(ResourceOperation::Consume, "Energy", 2)];
+        let leases = [(1, 8, "second"), (2, 7, "first")];
+        for (instance, _, _) in leases {
+            let instance = InstanceId(instance);
+            ledger.command(&Command::Acquire { instance, requirements: requirements(), priority: 0 });
+        }
+        for (instance, id, battery) in leases {
+            let lease = Lease { consumed: vec![units(battery, "Energy", 2)], ..lease(id) };
+            ledger.event(Timestamp(1), &Event::Granted { instance: InstanceId(instance), lease });
+        }
+        let mut used_up: Vec<_> =
+            ledger.account.used_up().map(|(resource, one)| (resource, one.units.units())).collect();
+        used_up.sort_unstable();
+        assert_eq!(used_up, [("first", 2), ("second", 2)]);
     }
 
     #[test]

@@ -366,7 +366,7 @@ pub struct IncreaseFact {
     #[prost(double, tag = "2")]
     pub by: f64,
 }
-/// Something that is to be had.
+/// A resource of the pool.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Resource {
     /// Unique among all resources, "path-planner-1@compute". Empty in a create: the manager gives one.
@@ -378,43 +378,42 @@ pub struct Resource {
     /// Its kind, "PathPlanner".
     #[prost(string, tag = "3")]
     pub kind: ::prost::alloc::string::String,
-    /// What selectors compare with. "endpoint" (text) says where its action service is. "standstill_ms" (whole, from 0 to 60000): when a
-    /// lease ends otherwise than by its holder's release, its units are nobody's until the provider has confirmed standstill
-    /// (ConfirmStandstill), or this time has passed; without it they are free at once.
+    /// The attributes that selectors compare. "endpoint" (text) is the address of its action service. "standstill_ms" (whole, from 0 to 60000): if a
+    /// lease ends otherwise than by its holder's release, its units are not free until the provider has confirmed standstill (ConfirmStandstill), or
+    /// this time has passed; without this attribute they are free at once.
     #[prost(btree_map = "string, message", tag = "4")]
     pub attributes: ::prost::alloc::collections::BTreeMap<
         ::prost::alloc::string::String,
         Value,
     >,
-    /// How much of it there is in all: more than nothing, at most 4294967295, with at most three decimals (as every amount here), and
-    /// whole units unless it is divisible.
+    /// The total amount: more than zero, at most 4294967295, with at most three decimals (as every amount here), and whole units unless the resource is divisible.
     #[prost(double, tag = "5")]
     pub capacity: f64,
-    /// The host that it is on; may be empty.
+    /// The host on which it is; may be empty.
     #[prost(string, tag = "6")]
     pub host: ::prost::alloc::string::String,
-    /// The session that owns it; it vanishes with it. Set by the manager.
+    /// The session that owns it; the resource vanishes with the session. Set by the manager.
     #[prost(string, tag = "7")]
     pub session_id: ::prost::alloc::string::String,
-    /// The revision of the pool that changed it last. Set by the manager.
+    /// The pool's revision of its last change. Set by the manager.
     #[prost(uint64, tag = "8")]
     pub revision: u64,
-    /// What it is doing. Set by the manager.
+    /// Its availability. Set by the manager.
     #[prost(enumeration = "ResourceState", tag = "9")]
     pub state: i32,
-    /// How much can be had now. Set by the manager.
+    /// The available amount. Set by the manager.
     #[prost(double, tag = "10")]
     pub free: f64,
-    /// Who has some of it under a lease now. Set by the manager.
+    /// Who holds units of it under a lease now. Set by the manager.
     #[prost(message, repeated, tag = "11")]
     pub holdings: ::prost::alloc::vec::Vec<Holding>,
-    /// Parts of a unit can be had: a battery's charge.
+    /// Parts of a unit can be acquired: a battery's charge.
     #[prost(bool, tag = "12")]
     pub divisible: bool,
-    /// What is consumed is gone for good, also when the task has ended.
+    /// Consumed units are gone for good, also after the end of the task.
     #[prost(bool, tag = "13")]
     pub non_renewable: bool,
-    /// What leases that have ended have left, until the provider has confirmed standstill. Set by the manager.
+    /// Units that ended leases have left, until the provider has confirmed standstill. Set by the manager.
     #[prost(message, repeated, tag = "14")]
     pub ending: ::prost::alloc::vec::Vec<EndingUnits>,
 }
@@ -430,10 +429,10 @@ pub struct EndingUnits {
     /// How much.
     #[prost(double, tag = "3")]
     pub units: f64,
-    /// The session that it was of.
+    /// The session that had the lease.
     #[prost(string, tag = "4")]
     pub session_id: ::prost::alloc::string::String,
-    /// They are free after this time at the latest, in milliseconds from when this was said.
+    /// They are free after this time at the latest, in milliseconds from this answer.
     #[prost(uint64, tag = "5")]
     pub within_ms: u64,
 }
@@ -452,18 +451,17 @@ pub struct Holding {
     /// The session of the lease.
     #[prost(string, tag = "4")]
     pub session_id: ::prost::alloc::string::String,
-    /// What the holder said it is, for people.
+    /// Description of the holder, for people.
     #[prost(string, tag = "5")]
     pub holder: ::prost::alloc::string::String,
-    /// Who opened that session, as the connection proved it: `uid 1000`, `control (certificate)`, `anonymous`. Empty where nobody knows.
-    /// Set by the manager.
+    /// The caller who opened that session, as the connection proved: `uid 1000`, `control (certificate)`, `anonymous`. Empty if unknown. Set by the manager.
     #[prost(string, tag = "6")]
     pub opened_by: ::prost::alloc::string::String,
 }
-/// What is asked of the resource manager.
+/// A requirement to the resource manager.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Requirement {
-    /// What is done with it.
+    /// The operation.
     #[prost(enumeration = "ResourceOperation", tag = "1")]
     pub operation: i32,
     /// The kind of resource.
@@ -472,50 +470,49 @@ pub struct Requirement {
     /// The class; unspecified accepts every class.
     #[prost(enumeration = "ResourceClass", tag = "3")]
     pub class: i32,
-    /// Attributes that it must have (for create: that it gets).
+    /// Attributes that the resource must have (for create: that it gets).
     #[prost(btree_map = "string, message", tag = "4")]
     pub attributes: ::prost::alloc::collections::BTreeMap<
         ::prost::alloc::string::String,
         Value,
     >,
-    /// How much in all, of what is not divisible how many: more than nothing, at most three decimals. A part of a unit is had of
-    /// divisible resources only.
+    /// The total amount; for indivisible resources the number of units. More than zero, at most three decimals. Only divisible resources can be acquired
+    /// in parts of a unit.
     #[prost(double, tag = "5")]
     pub count: f64,
-    /// What its attributes must be like besides; all of them.
+    /// Further conditions on its attributes; all must hold.
     #[prost(message, repeated, tag = "6")]
     pub conditions: ::prost::alloc::vec::Vec<Condition>,
-    /// For create: parts of a unit can be had.
+    /// For create: parts of a unit can be acquired.
     #[prost(bool, tag = "7")]
     pub divisible: bool,
 }
-/// What an attribute must be like. An attribute that is not there meets none; `host` is the resource's host unless it has an
-/// attribute of that name.
+/// A condition on an attribute. A missing attribute satisfies none; `host` is the resource's host unless it has an attribute of that name.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Condition {
     /// The attribute's name.
     #[prost(string, tag = "1")]
     pub attribute: ::prost::alloc::string::String,
-    /// How it is compared.
+    /// The comparison.
     #[prost(enumeration = "Comparison", tag = "2")]
     pub comparison: i32,
-    /// With what; a list for IN, unset for HAS.
+    /// The value to compare with; a list for IN, unset for HAS.
     #[prost(message, optional, tag = "3")]
     pub value: ::core::option::Option<Value>,
 }
-/// What an acquire was granted.
+/// The grant of an acquire.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Lease {
     /// Its id.
     #[prost(uint64, tag = "1")]
     pub id: u64,
-    /// Grows strictly over all leases; who does the work refuses an older one than it has seen.
+    /// Strictly increasing over all leases; a provider refuses a smaller token than it has seen.
     #[prost(uint64, tag = "2")]
     pub token: u64,
     /// The blocked resources, in the order of the requirements.
     #[prost(message, repeated, tag = "3")]
     pub resources: ::prost::alloc::vec::Vec<LeasedResource>,
-    /// The session that holds it. Set by the manager; in a goal it may be empty, and a provider compares it where it is not.
+    /// The session that holds it. Set by the manager; in a goal it may be empty, and a provider compares it if it is not.
     #[prost(string, tag = "4")]
     pub session_id: ::prost::alloc::string::String,
     /// What the grant has used up.
@@ -528,14 +525,14 @@ pub struct OperatedUnits {
     /// The resource's id.
     #[prost(string, tag = "1")]
     pub resource_id: ::prost::alloc::string::String,
-    /// Its kind, which may be below the one that was asked for.
+    /// Its kind, which may be a subclass of the requested one.
     #[prost(string, tag = "2")]
     pub kind: ::prost::alloc::string::String,
-    /// How much of it.
+    /// The amount.
     #[prost(double, tag = "3")]
     pub units: f64,
-    /// Whether that is over with the session that it was done for: what was created vanishes, what was used up returns or vanishes, and what
-    /// was deleted would have vanished. Otherwise it stays so.
+    /// Whether the effect ends with the session for which it was made: created units vanish, used-up units return or vanish, and deleted units would
+    /// have vanished. Otherwise the effect stays.
     #[prost(bool, tag = "4")]
     pub ends_with_session: bool,
 }
@@ -548,17 +545,17 @@ pub struct LeasedResource {
     /// Its kind.
     #[prost(string, tag = "2")]
     pub kind: ::prost::alloc::string::String,
-    /// Where its action service is served ("<http://127.0.0.1:4000",> "unix:/path"); empty where it performs nothing.
+    /// Address of its action service ("<http://127.0.0.1:4000",> "unix:/path"); empty if it performs no actions.
     #[prost(string, tag = "3")]
     pub endpoint: ::prost::alloc::string::String,
-    /// The kinds that its kind is a subclass of.
+    /// The superclasses of its kind.
     #[prost(string, repeated, tag = "4")]
     pub superclasses: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
 /// Asks for a resource to be added.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct CreateRequest {
-    /// Makes the call idempotent: the same id again gets the first answer.
+    /// Makes the call idempotent: a repeated id gets the first answer.
     #[prost(string, tag = "1")]
     pub request_id: ::prost::alloc::string::String,
     /// The session that will own it.
@@ -584,23 +581,23 @@ pub struct ConsumeRequest {
     /// The session that consumes.
     #[prost(string, tag = "2")]
     pub session_id: ::prost::alloc::string::String,
-    /// What; its operation is consume.
+    /// The requirement; its operation is consume.
     #[prost(message, optional, tag = "3")]
     pub requirement: ::core::option::Option<Requirement>,
-    /// Of this resource alone; NOT_FOUND when it is not there. Empty for any that fits.
+    /// Only from this resource; NOT_FOUND if it does not exist. Empty for any that fits.
     #[prost(string, tag = "4")]
     pub resource_id: ::prost::alloc::string::String,
 }
 /// What was consumed.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ConsumeResponse {
-    /// The resources of which units were consumed.
+    /// The ids of the resources from which units were consumed.
     #[prost(string, repeated, tag = "1")]
     pub resource_ids: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
     /// The pool's revision after it.
     #[prost(uint64, tag = "2")]
     pub revision: u64,
-    /// How much of each. Empty where an earlier version performed the request.
+    /// The amount for each. Empty if an earlier version performed the request.
     #[prost(message, repeated, tag = "3")]
     pub consumed: ::prost::alloc::vec::Vec<OperatedUnits>,
 }
@@ -613,19 +610,19 @@ pub struct DeleteRequest {
     /// The session that deletes.
     #[prost(string, tag = "2")]
     pub session_id: ::prost::alloc::string::String,
-    /// Which; exactly one is set.
+    /// The resources to remove; exactly one field is set.
     #[prost(oneof = "delete_request::Target", tags = "3, 4")]
     pub target: ::core::option::Option<delete_request::Target>,
 }
 /// Nested message and enum types in `DeleteRequest`.
 pub mod delete_request {
-    /// Which; exactly one is set.
+    /// The resources to remove; exactly one field is set.
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Target {
         /// One, by its id.
         #[prost(string, tag = "3")]
         ResourceId(::prost::alloc::string::String),
-        /// As many as its count says; its operation is delete.
+        /// As many units as its count says; its operation is delete.
         #[prost(message, tag = "4")]
         Requirement(super::Requirement),
     }
@@ -639,38 +636,38 @@ pub struct DeleteResponse {
     /// The pool's revision after it.
     #[prost(uint64, tag = "2")]
     pub revision: u64,
-    /// How much of each. Empty for one that was deleted by its id, and where an earlier version performed the request.
+    /// The amount for each. Empty for a resource that was deleted by its id, and if an earlier version performed the request.
     #[prost(message, repeated, tag = "3")]
     pub deleted: ::prost::alloc::vec::Vec<OperatedUnits>,
 }
-/// Asks what requests came to.
+/// Asks for the results of earlier requests.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct RecallRequest {
-    /// A session of the caller's: what is asked for was for this one or for another of the same opener.
+    /// A session of the caller: the requests were made for it or for another session of the same opener.
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
     /// The requests, at most 1,000.
     #[prost(string, repeated, tag = "2")]
     pub request_ids: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
-/// What they came to.
+/// The results of earlier requests.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct RecallResponse {
-    /// In the order of the question.
+    /// In the order of the requested ids.
     #[prost(message, repeated, tag = "1")]
     pub requests: ::prost::alloc::vec::Vec<RecalledRequest>,
 }
-/// What one request came to.
+/// The result of one request.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct RecalledRequest {
-    /// Whether its answer is known. Of one caller the oldest answers are forgotten first: one that is not known was never performed where that of
-    /// an older request is.
+    /// Whether its answer is known. A caller's oldest answers are forgotten first: if an answer is unknown and that of an older request is known, the
+    /// request was never performed.
     #[prost(bool, tag = "1")]
     pub known: bool,
-    /// The id of what it created; empty for another request.
+    /// The id of the resource that it created; empty for other requests.
     #[prost(string, tag = "2")]
     pub created_resource_id: ::prost::alloc::string::String,
-    /// What it deleted or used up. Empty for another request, and where an earlier version performed it.
+    /// The units that it deleted or used up. Empty for other requests, and if an earlier version performed it.
     #[prost(message, repeated, tag = "3")]
     pub operated: ::prost::alloc::vec::Vec<OperatedUnits>,
 }
@@ -683,16 +680,16 @@ pub struct BlockRequest {
     /// The session that will hold the lease.
     #[prost(string, tag = "2")]
     pub session_id: ::prost::alloc::string::String,
-    /// What; its operation is block.
+    /// The requirement; its operation is block.
     #[prost(message, optional, tag = "3")]
     pub requirement: ::core::option::Option<Requirement>,
     /// As in AcquireRequest.
     #[prost(int64, tag = "4")]
     pub priority: i64,
-    /// How long to wait at the most, in milliseconds from the arrival of the call; at least 1.
+    /// Maximum time to wait, in milliseconds from the arrival of the call; at least 1.
     #[prost(uint64, tag = "5")]
     pub deadline_ms: u64,
-    /// What the holder is, for people: "fetch_boxes/place_all\[2\]/plan_transfer".
+    /// Description of the holder, for people: "fetch_boxes/place_all\[2\]/plan_transfer".
     #[prost(string, tag = "6")]
     pub holder: ::prost::alloc::string::String,
 }
@@ -715,14 +712,14 @@ pub struct ResourceServiceReleaseRequest {
     /// The lease.
     #[prost(uint64, tag = "3")]
     pub lease_id: u64,
-    /// What the next holder of its resources is told, at most 256 bytes: for task control, of what it has made of the world until now.
+    /// Note for the next holder of its resources, at most 256 bytes: task control tells with it what it has changed in the world until now.
     #[prost(string, tag = "4")]
     pub note: ::prost::alloc::string::String,
 }
 /// The lease has ended.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ResourceServiceReleaseResponse {
-    /// False when it had ended before.
+    /// False if it had ended before.
     #[prost(bool, tag = "1")]
     pub released: bool,
     /// The pool's revision after it.
@@ -738,44 +735,44 @@ pub struct WithdrawRequest {
     /// The session that asked.
     #[prost(string, tag = "2")]
     pub session_id: ::prost::alloc::string::String,
-    /// On a session's stream: the id of the block or acquire that nobody waits for any more. Only that question is undone: the lease stays as
-    /// long as another question of the same request id waits for it or was answered with it. 0 undoes the request for all who asked.
+    /// On a session's stream: the id of the block or acquire whose answer is not awaited any more. Only that question is undone: the lease stays as long
+    /// as another question of the same request id waits for it or was answered with it. 0 undoes the request for all who asked.
     #[prost(uint64, tag = "3")]
     pub call: u64,
-    /// On a session's stream, beside `call`: no answer to an earlier question of that request id was heard either, for its stream broke. The
-    /// lease goes back also where such a question was answered with it. Not to be set while another question of the request is under way.
+    /// On a session's stream, beside `call`: no answer to an earlier question of that request id was received either, because its stream broke. The
+    /// lease then goes back even if such a question was answered with it. Must not be set while another question of the request is under way.
     #[prost(bool, tag = "4")]
     pub unheard: bool,
 }
 /// It is undone.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct WithdrawResponse {
-    /// False when there was nothing to undo: never asked, refused, or released before.
+    /// False if there was nothing to undo: never requested, refused, or released before.
     #[prost(bool, tag = "1")]
     pub withdrawn: bool,
 }
-/// Asks whether resources are there.
+/// Asks whether resources exist.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ExistsRequest {
-    /// What; its operation is exists.
+    /// The requirement; its operation is exists.
     #[prost(message, optional, tag = "1")]
     pub requirement: ::core::option::Option<Requirement>,
 }
-/// Whether they are.
+/// Whether they exist.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ExistsResponse {
-    /// Whether at least as many as asked for fit. Of a kind without class, attributes and conditions they are counted at one moment;
-    /// otherwise some thousand resources are looked at in a turn, and what changes in between counts as it is when it is looked at.
+    /// Whether at least the requested amount fits. Resources of a kind without class, attributes and conditions are counted at one moment; otherwise
+    /// some thousand resources are examined in a turn, and each counts as it is when it is examined.
     #[prost(bool, tag = "1")]
     pub exists: bool,
-    /// The ids of those that fit, in order, at most 1,000.
+    /// The ids of fitting resources, sorted, at most 1,000.
     #[prost(string, repeated, tag = "2")]
     pub resource_ids: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
 /// Asks for several resources at once.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct AcquireRequest {
-    /// Makes the call idempotent: a repeated one joins the one that waits, or gets its lease.
+    /// Makes the call idempotent: a repeated call joins the waiting one, or gets its lease.
     #[prost(string, tag = "1")]
     pub request_id: ::prost::alloc::string::String,
     /// The session that will hold the lease.
@@ -784,22 +781,22 @@ pub struct AcquireRequest {
     /// Blocks, consumes and exists; at least one.
     #[prost(message, repeated, tag = "3")]
     pub requirements: ::prost::alloc::vec::Vec<Requirement>,
-    /// Larger first, among what one session asks for, and among the first requests of sessions that have had about their shares and asked
-    /// within the same ten seconds; among equals first come, first served. The bits from 2^60 on are the urgency, which comes before due times.
+    /// Larger first, among the requests of one session, and among the first requests of sessions that have had about their shares and asked within the
+    /// same ten seconds; equal priorities first come, first served. The bits from 2^60 on are the urgency, which comes before due times.
     #[prost(int64, tag = "4")]
     pub priority: i64,
-    /// How long to wait at the most, in milliseconds from the arrival of the call; at least 1.
+    /// Maximum time to wait, in milliseconds from the arrival of the call; at least 1.
     #[prost(uint64, tag = "5")]
     pub deadline_ms: u64,
-    /// What the holder is, for people.
+    /// Description of the holder, for people.
     #[prost(string, tag = "6")]
     pub holder: ::prost::alloc::string::String,
-    /// It may turn out not to be needed. All that is needed for certain comes first.
+    /// The resources may turn out not to be needed. All requests that are certain come first.
     #[prost(bool, tag = "7")]
     pub speculative: bool,
-    /// The request id of an acquire of the session that wanted the same, whose place this takes: it keeps the time at which that one was asked,
-    /// where that one waits, or has left without a lease within the last ten seconds. Empty for none. One that was speculative leaves the last
-    /// ten seconds of its waiting to one that is not.
+    /// The request id of an earlier acquire of the session for the same resources, whose place this one takes: it keeps the time of that request, if
+    /// that one waits, or has left without a lease within the last ten seconds. Empty for none. If that one was speculative and this one is not, only
+    /// the last ten seconds of its waiting are kept.
     #[prost(string, tag = "8")]
     pub instead_of: ::prost::alloc::string::String,
 }
@@ -809,22 +806,21 @@ pub struct AcquireResponse {
     /// The lease.
     #[prost(message, optional, tag = "1")]
     pub lease: ::core::option::Option<Lease>,
-    /// What those who gave its resources back within the last minute have left to be told, each once. A resource manager that was started anew
-    /// knows none.
+    /// The notes of those who gave its resources back within the last minute, each once. A restarted resource manager has none.
     #[prost(message, repeated, tag = "2")]
     pub notes: ::prost::alloc::vec::Vec<HolderNote>,
 }
-/// What whoever gave a resource back has left to be told to its next holder.
+/// A note that a holder of a resource has left for the next holder.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct HolderNote {
     /// The session that held it.
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
-    /// What it left.
+    /// The text.
     #[prost(string, tag = "2")]
     pub note: ::prost::alloc::string::String,
 }
-/// Asks for the resources that are there.
+/// Asks for the present resources.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ListRequest {
     /// Only of these kinds; empty for every kind.
@@ -836,37 +832,37 @@ pub struct ListRequest {
     /// Only on this host; empty for every host.
     #[prost(string, tag = "3")]
     pub host: ::prost::alloc::string::String,
-    /// Only those that have these attributes.
+    /// Only those with these attributes.
     #[prost(btree_map = "string, message", tag = "4")]
     pub attributes: ::prost::alloc::collections::BTreeMap<
         ::prost::alloc::string::String,
         Value,
     >,
-    /// Only those that this session provides; empty for everybody's.
+    /// Only those that this session provides; empty for all sessions.
     #[prost(string, tag = "5")]
     pub session_id: ::prost::alloc::string::String,
-    /// Only those whose attributes are like this; all of them.
+    /// Only those whose attributes satisfy all of these conditions.
     #[prost(message, repeated, tag = "6")]
     pub conditions: ::prost::alloc::vec::Vec<Condition>,
-    /// In pages of about so many bytes, at most 8 MiB; one resource is always on a page. 0: all at once, which is RESOURCE_EXHAUSTED
-    /// where that is more than a message may have.
+    /// Size of a page in bytes (approximately), at most 8 MiB; a page has at least one resource. 0: all at once, which is RESOURCE_EXHAUSTED if that
+    /// exceeds the size of a message.
     #[prost(uint32, tag = "7")]
     pub page_bytes: u32,
-    /// The next_page_token of the page before; empty for the first.
+    /// The next_page_token of the previous page; empty for the first.
     #[prost(string, tag = "8")]
     pub page_token: ::prost::alloc::string::String,
 }
-/// The resources that are there.
+/// The present resources.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ListResponse {
-    /// In the order of ids.
+    /// Sorted by id.
     #[prost(message, repeated, tag = "1")]
     pub resources: ::prost::alloc::vec::Vec<Resource>,
-    /// The pool's revision when the page was begun. Each resource is as it was then or a little later: some thousand are looked at in a
-    /// turn, and others have theirs in between. Who needs all of one revision watches: a watch begins with that.
+    /// The pool's revision when the page was begun. Each resource is as it was then or a little later: some thousand are examined in a turn, and other
+    /// requests are handled in between. A client that needs all of one revision watches: a watch begins with that.
     #[prost(uint64, tag = "2")]
     pub revision: u64,
-    /// Asks for the page behind this one; empty: there is none. What is created or deleted meanwhile may be on no page, nothing is on two.
+    /// Requests the next page; empty: there is none. Resources that are created or deleted meanwhile may be on no page, but none is on two.
     #[prost(string, tag = "3")]
     pub next_page_token: ::prost::alloc::string::String,
 }
@@ -876,16 +872,16 @@ pub struct ResourceServiceWatchRequest {
     /// Only of these kinds; empty for every kind.
     #[prost(string, repeated, tag = "1")]
     pub kinds: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
-    /// Go on after this revision: no snapshot.
+    /// Continue after this revision: no snapshot.
     #[prost(uint64, optional, tag = "2")]
     pub after_revision: ::core::option::Option<u64>,
-    /// And of the events of that revision, after this one: that of the last event that was seen. Unset: after all of them.
+    /// And after this event of that revision: the `part` of the last event seen. Unset: after all its events.
     #[prost(uint32, optional, tag = "3")]
     pub after_part: ::core::option::Option<u32>,
-    /// The client puts a snapshot of several messages together. Otherwise it is RESOURCE_EXHAUSTED where it is more than a message may have.
+    /// The client assembles a snapshot from several messages. Otherwise a snapshot that exceeds the size of a message is RESOURCE_EXHAUSTED.
     #[prost(bool, tag = "4")]
     pub in_parts: bool,
-    /// Only of the resources of these ids; empty for every id. A provider that watches who holds it names its own.
+    /// Only the resources with these ids; empty for all. A provider that watches the holders of its resources names its own.
     #[prost(string, repeated, tag = "5")]
     pub resource_ids: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
@@ -901,40 +897,40 @@ pub mod resource_service_watch_response {
     /// Exactly one is set.
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Kind {
-        /// What is there at the start.
+        /// The present resources.
         #[prost(message, tag = "1")]
         Snapshot(super::ResourceSnapshot),
-        /// What happened since.
+        /// A change since then.
         #[prost(message, tag = "2")]
         Event(super::ResourceEvent),
     }
 }
-/// What is there.
+/// The present resources.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ResourceSnapshot {
     /// The pool's revision; events follow from the next one on.
     #[prost(uint64, tag = "1")]
     pub revision: u64,
-    /// In the order of ids.
+    /// Sorted by id.
     #[prost(message, repeated, tag = "2")]
     pub resources: ::prost::alloc::vec::Vec<Resource>,
-    /// The lease that was granted last, 0 before the first. Lease ids grow: one up to this that holds nothing here has ended.
+    /// The lease that was granted last, 0 before the first. Lease ids grow: a lease up to this one that holds nothing here has ended.
     #[prost(uint64, tag = "3")]
     pub youngest_lease_id: u64,
-    /// The next message goes on with it: of the same revision, with the resources behind these.
+    /// The snapshot continues with the next message: the same revision, the next resources.
     #[prost(bool, tag = "4")]
     pub more: bool,
 }
 /// One change of one resource.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ResourceEvent {
-    /// The pool's revision with it. The events of one revision arrive together.
+    /// The pool's revision after it. The events of one revision arrive together.
     #[prost(uint64, tag = "1")]
     pub revision: u64,
     /// What happened.
     #[prost(enumeration = "ResourceEventKind", tag = "2")]
     pub kind: i32,
-    /// The resource after it (before it, when deleted).
+    /// The resource after it (before it, if deleted).
     #[prost(message, optional, tag = "3")]
     pub resource: ::core::option::Option<Resource>,
     /// The lease, when leased or released, and when what it had left is free; else 0.
@@ -943,10 +939,10 @@ pub struct ResourceEvent {
     /// Its fencing token; else 0.
     #[prost(uint64, tag = "5")]
     pub token: u64,
-    /// Why, where there is something to say: "session expired".
+    /// The reason, if there is one: "session expired".
     #[prost(string, tag = "6")]
     pub reason: ::prost::alloc::string::String,
-    /// Which of the events of its revision it is, from 0: a lease of three resources makes three.
+    /// Its number among the events of its revision, from 0: a lease of three resources has three events.
     #[prost(uint32, tag = "7")]
     pub part: u32,
 }
@@ -959,15 +955,14 @@ pub struct KeepAliveRequest {
     /// The session lives this long from the arrival of the ping, in milliseconds; 0 ends it now.
     #[prost(uint64, tag = "2")]
     pub ttl_ms: u64,
-    /// Who this is, for people: "process-manager@compute".
+    /// The client's name, for people: "process-manager@compute".
     #[prost(string, tag = "3")]
     pub client: ::prost::alloc::string::String,
-    /// How much the session is to have of what several want, beside the shares of the others: from 0.01 to 100; 0 is 1, the usual share. It
-    /// counts from this ping on.
+    /// The share of contested resources that the session is to have, relative to the shares of others: from 0.01 to 100; 0 is 1, the usual share. It
+    /// applies from this ping on.
     #[prost(double, tag = "4")]
     pub share: f64,
-    /// In how many milliseconds from the arrival of the ping its task is due; unset: it is never due. A due time that moves by less than a
-    /// second stays.
+    /// In how many milliseconds from the arrival of the ping its task is due; unset: never. A change of the due time by less than a second is ignored.
     #[prost(int64, optional, tag = "5")]
     pub due_in_ms: ::core::option::Option<i64>,
 }
@@ -977,27 +972,27 @@ pub struct KeepAliveResponse {
     /// The session.
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
-    /// How long it lives from now unless pinged again, in milliseconds; the manager may shorten what was asked for.
+    /// How long it lives from now without another ping, in milliseconds; the manager may shorten the requested time.
     #[prost(uint64, tag = "2")]
     pub ttl_ms: u64,
-    /// This ping made the session: nothing that an earlier one of the same id had created or held is there any more.
+    /// This ping created the session: nothing that an earlier session of the same id had created or held exists any more.
     #[prost(bool, tag = "3")]
     pub created: bool,
     /// The pool's revision.
     #[prost(uint64, tag = "4")]
     pub revision: u64,
-    /// Which of all sessions of the pool this is, also after a restart or a failover: a session that was made anew has another number. Tells a
-    /// client for which the answer with `created` was lost. 0 where the manager does not number its sessions, and where this ping ended it.
+    /// The number of the session among all sessions of the pool, also after a restart or a failover: a session that was created again has another
+    /// number. It tells a client that has lost the answer with `created`. 0 if the manager does not number its sessions, and if this ping ended it.
     #[prost(uint64, tag = "5")]
     pub number: u64,
 }
 /// A question on a session's stream.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SessionRequest {
-    /// Chosen by the client; the answer has it too. Another one for each call under way; 0 for calls that need not be told apart.
+    /// Chosen by the client and repeated in the answer. Different for each call under way; 0 for calls that need not be told apart.
     #[prost(uint64, tag = "1")]
     pub id: u64,
-    /// The W3C trace context of the call, as the header `traceparent` of a call of its own has it; may be empty.
+    /// The W3C trace context of the call, as the header `traceparent` of a separate call; may be empty.
     #[prost(string, tag = "7")]
     pub traceparent: ::prost::alloc::string::String,
     /// Exactly one is set.
@@ -1029,7 +1024,7 @@ pub mod session_request {
 /// An answer on a session's stream.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SessionResponse {
-    /// The question's.
+    /// The id of the question.
     #[prost(uint64, tag = "1")]
     pub id: u64,
     /// Exactly one is set.
@@ -1061,7 +1056,7 @@ pub mod session_response {
         Failure(super::CallFailure),
     }
 }
-/// Why a call on a stream failed: what the status of a call of its own would have said.
+/// Why a call on a stream failed: the status that a separate call would have had.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct CallFailure {
     /// A gRPC status code.
@@ -1070,7 +1065,7 @@ pub struct CallFailure {
     /// For people.
     #[prost(string, tag = "2")]
     pub message: ::prost::alloc::string::String,
-    /// A serialised google.rpc.Status with the reason and, where it serves, the delay after which to try again.
+    /// A serialised google.rpc.Status with the reason and, where useful, the delay before a retry.
     #[prost(bytes = "vec", tag = "3")]
     pub details: ::prost::alloc::vec::Vec<u8>,
 }
@@ -1093,7 +1088,7 @@ pub struct ConfirmStandstillRequest {
 /// It is known.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ConfirmStandstillResponse {
-    /// False when the lease had left nothing of the resource, or lives.
+    /// False if the lease had left no units of the resource, or is alive.
     #[prost(bool, tag = "1")]
     pub freed: bool,
     /// The pool's revision after it.
@@ -1117,18 +1112,18 @@ pub struct ResourceServiceGetResponse {
 /// Asks why acquires wait.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ExplainRequest {
-    /// The request id of one; empty for the first hundred of the queue.
+    /// The request id of an acquire; empty for the first hundred of the queue.
     #[prost(string, tag = "1")]
     pub request_id: ::prost::alloc::string::String,
 }
 /// Why they wait.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ExplainResponse {
-    /// In the order in which they are served; as many as a message has room for. Where it takes long to say why, they are explained one
-    /// after the other, and who has got what it wants meanwhile is left out.
+    /// In the order in which they are served; as many as fit in a message. If explanations take long, the acquires are explained one after the other,
+    /// and those that were granted meanwhile are left out.
     #[prost(message, repeated, tag = "1")]
     pub waiting: ::prost::alloc::vec::Vec<WaitingAcquire>,
-    /// How many wait in all.
+    /// Number of all waiting acquires.
     #[prost(uint32, tag = "2")]
     pub total: u32,
 }
@@ -1138,38 +1133,38 @@ pub struct WaitingAcquire {
     /// Its request id; may be empty.
     #[prost(string, tag = "1")]
     pub request_id: ::prost::alloc::string::String,
-    /// Who asks.
+    /// The session that asks.
     #[prost(string, tag = "2")]
     pub session_id: ::prost::alloc::string::String,
-    /// What the holder is to be, for people.
+    /// Description of the future holder, for people.
     #[prost(string, tag = "3")]
     pub holder: ::prost::alloc::string::String,
     /// Its priority.
     #[prost(int64, tag = "4")]
     pub priority: i64,
-    /// How many are served before it.
+    /// Number of acquires that are served before it.
     #[prost(uint32, tag = "5")]
     pub ahead: u32,
     /// What is in the way of each requirement that cannot be met now, for people: "`block Arm`: held by lease-1 of session a".
     #[prost(string, repeated, tag = "6")]
     pub obstacles: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
-    /// The leases that hold what it lacks, at most 8 for each requirement; none where some of that is not there at all.
+    /// The leases that hold the units that it lacks, at most 8 for each requirement; empty if some of those units do not exist at all.
     #[prost(uint64, repeated, tag = "7")]
     pub held_by_leases: ::prost::alloc::vec::Vec<u64>,
     /// The share of its session.
     #[prost(double, tag = "8")]
     pub share: f64,
-    /// In how many milliseconds the task of its session is due; negative where that has passed; unset where it is never due.
+    /// In how many milliseconds its session's task is due; negative if that has passed; unset if it is never due.
     #[prost(int64, optional, tag = "9")]
     pub due_in_ms: ::core::option::Option<i64>,
-    /// It may turn out not to be needed.
+    /// The resources may turn out not to be needed.
     #[prost(bool, tag = "10")]
     pub speculative: bool,
-    /// For how many milliseconds it has waited, and what it took the place of.
+    /// How long it has waited, in milliseconds, including the wait of the request whose place it took.
     #[prost(uint64, tag = "11")]
     pub waiting_ms: u64,
 }
-/// Asks who is there.
+/// Asks for the sessions.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ListSessionsRequest {
     /// As in ListRequest.
@@ -1179,13 +1174,13 @@ pub struct ListSessionsRequest {
     #[prost(string, tag = "2")]
     pub page_token: ::prost::alloc::string::String,
 }
-/// Who is there.
+/// The sessions.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ListSessionsResponse {
-    /// In the order of ids. Each is as it was when it was looked at: a page may take several turns.
+    /// Sorted by id. Each is as it was when it was examined: a page may take several turns.
     #[prost(message, repeated, tag = "1")]
     pub sessions: ::prost::alloc::vec::Vec<SessionStatus>,
-    /// Asks for the page behind this one; empty: there is none. What is opened or ends meanwhile may be on no page, nothing is on two.
+    /// Requests the next page; empty: there is none. Sessions that open or end meanwhile may be on no page, but none is on two.
     #[prost(string, tag = "2")]
     pub next_page_token: ::prost::alloc::string::String,
 }
@@ -1195,32 +1190,32 @@ pub struct SessionStatus {
     /// Its id.
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
-    /// Who that is, for people.
+    /// The client's name, for people.
     #[prost(string, tag = "2")]
     pub client: ::prost::alloc::string::String,
     /// How long it lives without a ping, in milliseconds.
     #[prost(uint64, tag = "3")]
     pub ttl_ms: u64,
-    /// In how many milliseconds it ends unless pinged.
+    /// In how many milliseconds it ends without another ping.
     #[prost(uint64, tag = "4")]
     pub expires_in_ms: u64,
     /// Its leases, at most 1,000.
     #[prost(uint64, repeated, tag = "5")]
     pub lease_ids: ::prost::alloc::vec::Vec<u64>,
-    /// How many of its acquires wait.
+    /// Number of its queued acquires.
     #[prost(uint32, tag = "6")]
     pub waiting: u32,
     /// The resources that it provides, at most 1,000.
     #[prost(string, repeated, tag = "7")]
     pub resource_ids: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
-    /// Who opened it, as the connection proved it: `uid 1000`, `control (certificate)`, `anonymous`. Nobody else speaks for it, except an
-    /// operator. Empty where nobody knows.
+    /// The caller who opened it, as the connection proved: `uid 1000`, `control (certificate)`, `anonymous`. Nobody but an operator may also use it.
+    /// Empty if unknown.
     #[prost(string, tag = "8")]
     pub opened_by: ::prost::alloc::string::String,
     /// Its share.
     #[prost(double, tag = "9")]
     pub share: f64,
-    /// In how many milliseconds its task is due; negative where that has passed; unset where it is never due.
+    /// In how many milliseconds its task is due; negative if that has passed; unset if it is never due.
     #[prost(int64, optional, tag = "10")]
     pub due_in_ms: ::core::option::Option<i64>,
 }
@@ -1230,28 +1225,28 @@ pub struct EndTaskRequest {
     /// Makes the call idempotent.
     #[prost(string, tag = "1")]
     pub request_id: ::prost::alloc::string::String,
-    /// Whose task.
+    /// The session of the task.
     #[prost(string, tag = "2")]
     pub session_id: ::prost::alloc::string::String,
 }
-/// It is over. Where the task has consumed of very many resources, they return some thousand at a time before this is answered; who asks
-/// again, also after a restart in between, gets the rest done.
+/// The task is over. If it has consumed from very many resources, they return some thousand at a time before this answer; a client that asks again,
+/// also after a restart in between, gets the rest done.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct EndTaskResponse {
     /// The pool's revision after it.
     #[prost(uint64, tag = "1")]
     pub revision: u64,
 }
-/// Asks what is missing.
+/// Asks which resources are missing.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct WatchDemandRequest {
     /// The provider's session.
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
-    /// What it can provide; of nothing else it is asked.
+    /// What it can provide; it is asked for nothing else.
     #[prost(message, repeated, tag = "2")]
     pub provisions: ::prost::alloc::vec::Vec<Provision>,
-    /// What all of it has in common: what wants other attributes is not asked of it.
+    /// The attributes that all of it has; it is not asked for resources with other attributes.
     #[prost(btree_map = "string, message", tag = "3")]
     pub attributes: ::prost::alloc::collections::BTreeMap<
         ::prost::alloc::string::String,
@@ -1264,58 +1259,58 @@ pub struct Provision {
     /// The kind.
     #[prost(string, tag = "1")]
     pub kind: ::prost::alloc::string::String,
-    /// At most so many of it.
+    /// Maximum amount of it.
     #[prost(uint32, tag = "2")]
     pub most: u32,
-    /// It is asked for more of it as well for requests that wait for what exists and is held. Not for what moves something: two
-    /// drivers of one robot are no more robots.
+    /// Whether it is also asked for more if requests wait for existing units held by others. Not for hardware that moves: two drivers of one robot are
+    /// no more robots.
     #[prost(bool, tag = "3")]
     pub grows: bool,
 }
-/// What is missing now and asked of this provider. What is asked of one is not asked of another, unless it is more than all of them
-/// can provide.
+/// What is missing now and asked of this provider. What is asked of one provider is not asked of another, unless it is more than all of them can
+/// provide.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct WatchDemandResponse {
     /// One for each selector.
     #[prost(message, repeated, tag = "1")]
     pub demands: ::prost::alloc::vec::Vec<Demand>,
 }
-/// What waits for more than exists, or has waited for long for what is held.
+/// Resources that are missing, or held by others while requests have waited for long.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Demand {
-    /// What is selected; its count is how much is to come beside those that the provider's session provides.
+    /// The selector; its count is the amount needed in addition to what the provider's session provides.
     #[prost(message, optional, tag = "1")]
     pub requirement: ::core::option::Option<Requirement>,
-    /// The kinds that would do: its kind, and those below it.
+    /// The kinds that satisfy it: its kind, and the subclasses.
     #[prost(string, repeated, tag = "2")]
     pub kinds: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
-    /// How much of it the provider's session provides already.
+    /// The amount that the provider's session already provides.
     #[prost(double, tag = "3")]
     pub provided: f64,
-    /// How much of that count is for requests that wait for what exists and is held; the rest does not exist.
+    /// The part of the count for requests that wait for existing units held by others; the rest does not exist.
     #[prost(double, tag = "4")]
     pub queued: f64,
 }
-/// Says why there are no more of a kind for now.
+/// Reports why there are no more of a kind for now.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ReportShortageRequest {
-    /// The provider's session; with it goes what it said.
+    /// The provider's session; the report ends with it.
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
     /// The kind.
     #[prost(string, tag = "2")]
     pub kind: ::prost::alloc::string::String,
-    /// Why, for people; empty takes it back.
+    /// The reason, for people; empty takes the report back.
     #[prost(string, tag = "3")]
     pub reason: ::prost::alloc::string::String,
-    /// At most so many of it there can be for as long as that is so; those there are count.
+    /// Maximum amount for as long as the reason exists; existing ones count.
     #[prost(uint32, tag = "4")]
     pub most: u32,
 }
 /// It is known.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ReportShortageResponse {}
-/// The five classes of resources; the class says who may create one.
+/// The five classes of resources; the class determines who may create a resource.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum ResourceClass {
@@ -1366,7 +1361,7 @@ impl ResourceClass {
 pub enum ResourceOperation {
     /// Not allowed.
     Unspecified = 0,
-    /// Nobody else has it while the lease lives.
+    /// Exclusive while the lease lives.
     Block = 1,
     /// Used up for the rest of the task.
     Consume = 2,
@@ -1374,7 +1369,7 @@ pub enum ResourceOperation {
     Create = 3,
     /// Removed from the pool.
     Delete = 4,
-    /// Must be there at the time of the grant.
+    /// Must exist at the time of the grant.
     Exists = 5,
 }
 impl ResourceOperation {
@@ -1405,15 +1400,15 @@ impl ResourceOperation {
         }
     }
 }
-/// What a resource is doing.
+/// The availability of a resource.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum ResourceState {
     /// Not said.
     Unspecified = 0,
-    /// At least one unit can be had.
+    /// At least one unit is available.
     Free = 1,
-    /// No unit can be had now, some come back when a lease ends.
+    /// No unit is available now; some return when a lease ends.
     Leased = 2,
     /// Every unit has been consumed.
     Exhausted = 3,
@@ -1446,23 +1441,23 @@ impl ResourceState {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Comparison {
-    /// Not said: refused.
+    /// Not allowed.
     Unspecified = 0,
-    /// Exactly so; ints and floats are numbers.
+    /// Equal; ints and floats are numbers.
     Equal = 1,
-    /// Otherwise.
+    /// Not equal.
     NotEqual = 2,
-    /// Less, of numbers or of texts.
+    /// Less, for numbers or texts.
     Less = 3,
     /// At most.
     LessOrEqual = 4,
-    /// More.
+    /// Greater.
     Greater = 5,
     /// At least.
     GreaterOrEqual = 6,
     /// One of a list.
     In = 7,
-    /// There, whatever it is.
+    /// The attribute exists, with any value.
     Has = 8,
 }
 impl Comparison {
@@ -1511,10 +1506,10 @@ pub enum ResourceEventKind {
     Updated = 2,
     /// It is gone; a lease of it has ended.
     Deleted = 3,
-    /// Units of it went to a lease.
+    /// Units of it were granted to a lease.
     Leased = 4,
-    /// A lease of it ended: released, expired, or lost. What it held is free with this event, or is among what is ending; when that is
-    /// free there is another event, an update with the lease and the reason.
+    /// A lease of it ended: released, expired, or lost. The units that it held are free with this event, or among the ending ones; when those are free,
+    /// another event follows: an update with the lease and the reason.
     Released = 5,
 }
 impl ResourceEventKind {
@@ -1556,8 +1551,8 @@ pub mod resource_service_client {
     )]
     use tonic::codegen::*;
     use tonic::codegen::http::Uri;
-    /// Owns every resource: the operations of the paper (create, consume, delete, block, release, exists), and what makes them
-    /// usable by concurrent clients (acquire, list, watch, keep-alive). Every mutation is idempotent by its request id.
+    /// Owns every resource: the operations of the paper (create, consume, delete, block, release, exists), and what concurrent clients need besides
+    /// (acquire, list, watch, keep-alive). Every mutation is idempotent by its request id.
     #[derive(Debug, Clone)]
     pub struct ResourceServiceClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -1638,9 +1633,9 @@ pub mod resource_service_client {
             self.inner = self.inner.max_encoding_message_size(limit);
             self
         }
-        /// Adds a resource to the pool. An id that this session created before gets the new attributes and capacity (an
-        /// update); an id of another living session is ALREADY_EXISTS. A resource of the class TASK gives its id to one of another class: it is
-        /// deleted, unless an operator has made it. Answers an unknown session with FAILED_PRECONDITION.
+        /// Adds a resource to the pool. If this session created a resource of the same id before, its attributes and capacity are replaced (an update); an
+        /// id of another living session is ALREADY_EXISTS. A resource of the class TASK gives its id to one of another class: it is deleted, unless an
+        /// operator has made it. An unknown session is FAILED_PRECONDITION.
         pub async fn create(
             &mut self,
             request: impl tonic::IntoRequest<super::CreateRequest>,
@@ -1662,7 +1657,7 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "Create"));
             self.inner.unary(req, path, codec).await
         }
-        /// Uses capacity up until the session ends. FAILED_PRECONDITION when there is not enough now.
+        /// Uses up capacity until the session ends. FAILED_PRECONDITION if there is not enough now.
         pub async fn consume(
             &mut self,
             request: impl tonic::IntoRequest<super::ConsumeRequest>,
@@ -1687,7 +1682,7 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "Consume"));
             self.inner.unary(req, path, codec).await
         }
-        /// Removes resources. Who holds a lease of one loses it. NOT_FOUND when there is none.
+        /// Removes resources. Leases that hold them end. NOT_FOUND if there is no such resource.
         pub async fn delete(
             &mut self,
             request: impl tonic::IntoRequest<super::DeleteRequest>,
@@ -1709,8 +1704,7 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "Delete"));
             self.inner.unary(req, path, codec).await
         }
-        /// What requests of before came to, by their ids: for who has not heard the answer, and has lost the session that they were for. Performs
-        /// nothing.
+        /// The results of earlier requests, by their ids: for a client that has lost an answer together with the session of the request. Performs nothing.
         pub async fn recall(
             &mut self,
             request: impl tonic::IntoRequest<super::RecallRequest>,
@@ -1754,10 +1748,10 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "Block"));
             self.inner.unary(req, path, codec).await
         }
-        /// Undoes an acquire or a block by its request id: takes it out of the queue, or ends the lease that it was granted. All calls of that
-        /// request id lose it. The same request id once more acquires anew. Where the acquire was not heard of yet, it may be on its way: it is
-        /// refused when it arrives (ABORTED, WITHDRAWN; so are calls that wait). The manager hears of none that it refused for load, nor of those
-        /// before its last start: after the withdraw of such a one, use a new id.
+        /// Undoes an acquire or a block by its request id: takes it out of the queue, or ends the lease that it was granted. All calls with that request id
+        /// lose it. The same request id may acquire anew after that. If the manager has not heard of the acquire yet, it may be on its way: it is refused
+        /// when it arrives (ABORTED, WITHDRAWN; waiting calls are refused, too). The manager does not know acquires that it refused for load, nor those
+        /// before its last start: after the withdrawal of such an acquire, use a new id.
         pub async fn withdraw(
             &mut self,
             request: impl tonic::IntoRequest<super::WithdrawRequest>,
@@ -1807,8 +1801,8 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "Release"));
             self.inner.unary(req, path, codec).await
         }
-        /// The provider of a resource says that nothing moves any more for a lease that has ended: what the lease had left of the resource is
-        /// free. PERMISSION_DENIED for a resource of another session; NOT_FOUND for one that is not there.
+        /// The provider of a resource confirms standstill: nothing moves any more for a lease that has ended, so the units that it had left are free.
+        /// PERMISSION_DENIED for a resource of another session; NOT_FOUND for an unknown one.
         pub async fn confirm_standstill(
             &mut self,
             request: impl tonic::IntoRequest<super::ConfirmStandstillRequest>,
@@ -1833,7 +1827,7 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "ConfirmStandstill"));
             self.inner.unary(req, path, codec).await
         }
-        /// Whether resources that fit are there now, blocked or not.
+        /// Whether fitting resources exist now, blocked or not.
         pub async fn exists(
             &mut self,
             request: impl tonic::IntoRequest<super::ExistsRequest>,
@@ -1855,9 +1849,9 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "Exists"));
             self.inner.unary(req, path, codec).await
         }
-        /// Waits until all requirements can be met at once and takes them under one lease; all or nothing. DEADLINE_EXCEEDED
-        /// after the deadline, with what was waited for: what does not exist is waited for as well, because somebody may offer it
-        /// meanwhile. A cancelled call leaves the queue.
+        /// Waits until all requirements can be met at once and takes the resources under one lease; all or nothing. After the deadline DEADLINE_EXCEEDED,
+        /// with what was waited for: the call also waits for resources that do not exist, because somebody may offer them meanwhile. A cancelled call leaves
+        /// the queue.
         pub async fn acquire(
             &mut self,
             request: impl tonic::IntoRequest<super::AcquireRequest>,
@@ -1882,7 +1876,7 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "Acquire"));
             self.inner.unary(req, path, codec).await
         }
-        /// One resource. NOT_FOUND when it is not there.
+        /// One resource. NOT_FOUND if it does not exist.
         pub async fn get(
             &mut self,
             request: impl tonic::IntoRequest<super::ResourceServiceGetRequest>,
@@ -1907,7 +1901,7 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "Get"));
             self.inner.unary(req, path, codec).await
         }
-        /// What acquires wait for, and for whom. NOT_FOUND when the one asked for does not wait.
+        /// What acquires wait for, and which leases hold it. NOT_FOUND if the given request does not wait.
         pub async fn explain(
             &mut self,
             request: impl tonic::IntoRequest<super::ExplainRequest>,
@@ -1932,7 +1926,7 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "Explain"));
             self.inner.unary(req, path, codec).await
         }
-        /// Who is there: the sessions, in the order of ids.
+        /// The sessions, sorted by id.
         pub async fn list_sessions(
             &mut self,
             request: impl tonic::IntoRequest<super::ListSessionsRequest>,
@@ -1957,7 +1951,7 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "ListSessions"));
             self.inner.unary(req, path, codec).await
         }
-        /// The session's task is over: what it consumed of what is renewable returns.
+        /// The session's task is over: the renewable units that it consumed return.
         pub async fn end_task(
             &mut self,
             request: impl tonic::IntoRequest<super::EndTaskRequest>,
@@ -1982,8 +1976,8 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "EndTask"));
             self.inner.unary(req, path, codec).await
         }
-        /// Tells a provider what waits for more than exists, first at once and then whenever that changes: the newest, not every
-        /// state. Nothing, when nothing is missing (any more).
+        /// Tells a provider which resources are missing, first at once and then after every change: the newest state, not every state. An empty answer if
+        /// nothing is missing (any more).
         pub async fn watch_demand(
             &mut self,
             request: impl tonic::IntoRequest<super::WatchDemandRequest>,
@@ -2008,8 +2002,8 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "WatchDemand"));
             self.inner.server_streaming(req, path, codec).await
         }
-        /// A provider says that there can be no more of a kind than so many now, and why: no more is asked of it, and those who wait for
-        /// it are told with their deadline, and by Explain. FAILED_PRECONDITION where the session does not watch demand as one who provides it.
+        /// A provider reports that there can be at most so many of a kind now, and why: it is asked for no more, and those who wait for the kind are told
+        /// the reason with their deadline, and by Explain. FAILED_PRECONDITION if the session does not watch demand as a provider of the kind.
         pub async fn report_shortage(
             &mut self,
             request: impl tonic::IntoRequest<super::ReportShortageRequest>,
@@ -2034,7 +2028,7 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "ReportShortage"));
             self.inner.unary(req, path, codec).await
         }
-        /// The resources that are there now.
+        /// The present resources.
         pub async fn list(
             &mut self,
             request: impl tonic::IntoRequest<super::ListRequest>,
@@ -2056,8 +2050,8 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "List"));
             self.inner.unary(req, path, codec).await
         }
-        /// First a snapshot, then every change after it, in order, without a gap. With after_revision no snapshot, but every
-        /// change after that revision; OUT_OF_RANGE when they are not all known any more: then watch without it.
+        /// First a snapshot, then every later change, in order, without a gap. With after_revision no snapshot, but every change after that revision;
+        /// OUT_OF_RANGE if they are not all kept any more: then watch without it.
         pub async fn watch(
             &mut self,
             request: impl tonic::IntoRequest<super::ResourceServiceWatchRequest>,
@@ -2084,10 +2078,10 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "Watch"));
             self.inner.server_streaming(req, path, codec).await
         }
-        /// Creates a session with the first message and renews it with each further one; each is answered. A session whose
-        /// messages stay away for its time to live ends: its leases end and what it created vanishes. A broken stream does
-        /// not end it before that, so that a client can come back. PERMISSION_DENIED (NOT_YOURS) for the id of a session that another caller has,
-        /// or had: it is kept for that caller. Open a session with another id then.
+        /// Creates a session with the first message and renews it with each further one; each is answered. A session without messages for its time to live
+        /// ends: its leases end and what it created vanishes. A broken stream does not end the session before that, so that a client can reconnect.
+        /// PERMISSION_DENIED (NOT_YOURS) for the id of a session that another caller has, or had: the id is kept for that caller. Then open a session with
+        /// another id.
         pub async fn keep_alive(
             &mut self,
             request: impl tonic::IntoStreamingRequest<Message = super::KeepAliveRequest>,
@@ -2112,8 +2106,8 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "KeepAlive"));
             self.inner.streaming(req, path, codec).await
         }
-        /// The same calls over one stream, which costs a third of a call each: for who asks often. Answers come as they are there, not
-        /// in the order of questions. A stream that breaks withdraws what still waited on it; what was granted stays with its session.
+        /// The same calls over one stream, for frequent callers: each costs a third of a separate call. Answers come when they are ready, not in the order
+        /// of questions. A stream that breaks withdraws what still waited on it; what was granted stays with its session.
         pub async fn session(
             &mut self,
             request: impl tonic::IntoStreamingRequest<Message = super::SessionRequest>,
@@ -2153,25 +2147,24 @@ pub mod resource_service_server {
     /// Generated trait containing gRPC methods that should be implemented for use with ResourceServiceServer.
     #[async_trait]
     pub trait ResourceService: std::marker::Send + std::marker::Sync + 'static {
-        /// Adds a resource to the pool. An id that this session created before gets the new attributes and capacity (an
-        /// update); an id of another living session is ALREADY_EXISTS. A resource of the class TASK gives its id to one of another class: it is
-        /// deleted, unless an operator has made it. Answers an unknown session with FAILED_PRECONDITION.
+        /// Adds a resource to the pool. If this session created a resource of the same id before, its attributes and capacity are replaced (an update); an
+        /// id of another living session is ALREADY_EXISTS. A resource of the class TASK gives its id to one of another class: it is deleted, unless an
+        /// operator has made it. An unknown session is FAILED_PRECONDITION.
         async fn create(
             &self,
             request: tonic::Request<super::CreateRequest>,
         ) -> std::result::Result<tonic::Response<super::CreateResponse>, tonic::Status>;
-        /// Uses capacity up until the session ends. FAILED_PRECONDITION when there is not enough now.
+        /// Uses up capacity until the session ends. FAILED_PRECONDITION if there is not enough now.
         async fn consume(
             &self,
             request: tonic::Request<super::ConsumeRequest>,
         ) -> std::result::Result<tonic::Response<super::ConsumeResponse>, tonic::Status>;
-        /// Removes resources. Who holds a lease of one loses it. NOT_FOUND when there is none.
+        /// Removes resources. Leases that hold them end. NOT_FOUND if there is no such resource.
         async fn delete(
             &self,
             request: tonic::Request<super::DeleteRequest>,
         ) -> std::result::Result<tonic::Response<super::DeleteResponse>, tonic::Status>;
-        /// What requests of before came to, by their ids: for who has not heard the answer, and has lost the session that they were for. Performs
-        /// nothing.
+        /// The results of earlier requests, by their ids: for a client that has lost an answer together with the session of the request. Performs nothing.
         async fn recall(
             &self,
             request: tonic::Request<super::RecallRequest>,
@@ -2181,10 +2174,10 @@ pub mod resource_service_server {
             &self,
             request: tonic::Request<super::BlockRequest>,
         ) -> std::result::Result<tonic::Response<super::BlockResponse>, tonic::Status>;
-        /// Undoes an acquire or a block by its request id: takes it out of the queue, or ends the lease that it was granted. All calls of that
-        /// request id lose it. The same request id once more acquires anew. Where the acquire was not heard of yet, it may be on its way: it is
-        /// refused when it arrives (ABORTED, WITHDRAWN; so are calls that wait). The manager hears of none that it refused for load, nor of those
-        /// before its last start: after the withdraw of such a one, use a new id.
+        /// Undoes an acquire or a block by its request id: takes it out of the queue, or ends the lease that it was granted. All calls with that request id
+        /// lose it. The same request id may acquire anew after that. If the manager has not heard of the acquire yet, it may be on its way: it is refused
+        /// when it arrives (ABORTED, WITHDRAWN; waiting calls are refused, too). The manager does not know acquires that it refused for load, nor those
+        /// before its last start: after the withdrawal of such an acquire, use a new id.
         async fn withdraw(
             &self,
             request: tonic::Request<super::WithdrawRequest>,
@@ -2200,8 +2193,8 @@ pub mod resource_service_server {
             tonic::Response<super::ResourceServiceReleaseResponse>,
             tonic::Status,
         >;
-        /// The provider of a resource says that nothing moves any more for a lease that has ended: what the lease had left of the resource is
-        /// free. PERMISSION_DENIED for a resource of another session; NOT_FOUND for one that is not there.
+        /// The provider of a resource confirms standstill: nothing moves any more for a lease that has ended, so the units that it had left are free.
+        /// PERMISSION_DENIED for a resource of another session; NOT_FOUND for an unknown one.
         async fn confirm_standstill(
             &self,
             request: tonic::Request<super::ConfirmStandstillRequest>,
@@ -2209,19 +2202,19 @@ pub mod resource_service_server {
             tonic::Response<super::ConfirmStandstillResponse>,
             tonic::Status,
         >;
-        /// Whether resources that fit are there now, blocked or not.
+        /// Whether fitting resources exist now, blocked or not.
         async fn exists(
             &self,
             request: tonic::Request<super::ExistsRequest>,
         ) -> std::result::Result<tonic::Response<super::ExistsResponse>, tonic::Status>;
-        /// Waits until all requirements can be met at once and takes them under one lease; all or nothing. DEADLINE_EXCEEDED
-        /// after the deadline, with what was waited for: what does not exist is waited for as well, because somebody may offer it
-        /// meanwhile. A cancelled call leaves the queue.
+        /// Waits until all requirements can be met at once and takes the resources under one lease; all or nothing. After the deadline DEADLINE_EXCEEDED,
+        /// with what was waited for: the call also waits for resources that do not exist, because somebody may offer them meanwhile. A cancelled call leaves
+        /// the queue.
         async fn acquire(
             &self,
             request: tonic::Request<super::AcquireRequest>,
         ) -> std::result::Result<tonic::Response<super::AcquireResponse>, tonic::Status>;
-        /// One resource. NOT_FOUND when it is not there.
+        /// One resource. NOT_FOUND if it does not exist.
         async fn get(
             &self,
             request: tonic::Request<super::ResourceServiceGetRequest>,
@@ -2229,12 +2222,12 @@ pub mod resource_service_server {
             tonic::Response<super::ResourceServiceGetResponse>,
             tonic::Status,
         >;
-        /// What acquires wait for, and for whom. NOT_FOUND when the one asked for does not wait.
+        /// What acquires wait for, and which leases hold it. NOT_FOUND if the given request does not wait.
         async fn explain(
             &self,
             request: tonic::Request<super::ExplainRequest>,
         ) -> std::result::Result<tonic::Response<super::ExplainResponse>, tonic::Status>;
-        /// Who is there: the sessions, in the order of ids.
+        /// The sessions, sorted by id.
         async fn list_sessions(
             &self,
             request: tonic::Request<super::ListSessionsRequest>,
@@ -2242,7 +2235,7 @@ pub mod resource_service_server {
             tonic::Response<super::ListSessionsResponse>,
             tonic::Status,
         >;
-        /// The session's task is over: what it consumed of what is renewable returns.
+        /// The session's task is over: the renewable units that it consumed return.
         async fn end_task(
             &self,
             request: tonic::Request<super::EndTaskRequest>,
@@ -2253,8 +2246,8 @@ pub mod resource_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// Tells a provider what waits for more than exists, first at once and then whenever that changes: the newest, not every
-        /// state. Nothing, when nothing is missing (any more).
+        /// Tells a provider which resources are missing, first at once and then after every change: the newest state, not every state. An empty answer if
+        /// nothing is missing (any more).
         async fn watch_demand(
             &self,
             request: tonic::Request<super::WatchDemandRequest>,
@@ -2262,8 +2255,8 @@ pub mod resource_service_server {
             tonic::Response<Self::WatchDemandStream>,
             tonic::Status,
         >;
-        /// A provider says that there can be no more of a kind than so many now, and why: no more is asked of it, and those who wait for
-        /// it are told with their deadline, and by Explain. FAILED_PRECONDITION where the session does not watch demand as one who provides it.
+        /// A provider reports that there can be at most so many of a kind now, and why: it is asked for no more, and those who wait for the kind are told
+        /// the reason with their deadline, and by Explain. FAILED_PRECONDITION if the session does not watch demand as a provider of the kind.
         async fn report_shortage(
             &self,
             request: tonic::Request<super::ReportShortageRequest>,
@@ -2271,7 +2264,7 @@ pub mod resource_service_server {
             tonic::Response<super::ReportShortageResponse>,
             tonic::Status,
         >;
-        /// The resources that are there now.
+        /// The present resources.
         async fn list(
             &self,
             request: tonic::Request<super::ListRequest>,
@@ -2285,8 +2278,8 @@ pub mod resource_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// First a snapshot, then every change after it, in order, without a gap. With after_revision no snapshot, but every
-        /// change after that revision; OUT_OF_RANGE when they are not all known any more: then watch without it.
+        /// First a snapshot, then every later change, in order, without a gap. With after_revision no snapshot, but every change after that revision;
+        /// OUT_OF_RANGE if they are not all kept any more: then watch without it.
         async fn watch(
             &self,
             request: tonic::Request<super::ResourceServiceWatchRequest>,
@@ -2297,10 +2290,10 @@ pub mod resource_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// Creates a session with the first message and renews it with each further one; each is answered. A session whose
-        /// messages stay away for its time to live ends: its leases end and what it created vanishes. A broken stream does
-        /// not end it before that, so that a client can come back. PERMISSION_DENIED (NOT_YOURS) for the id of a session that another caller has,
-        /// or had: it is kept for that caller. Open a session with another id then.
+        /// Creates a session with the first message and renews it with each further one; each is answered. A session without messages for its time to live
+        /// ends: its leases end and what it created vanishes. A broken stream does not end the session before that, so that a client can reconnect.
+        /// PERMISSION_DENIED (NOT_YOURS) for the id of a session that another caller has, or had: the id is kept for that caller. Then open a session with
+        /// another id.
         async fn keep_alive(
             &self,
             request: tonic::Request<tonic::Streaming<super::KeepAliveRequest>>,
@@ -2311,15 +2304,15 @@ pub mod resource_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// The same calls over one stream, which costs a third of a call each: for who asks often. Answers come as they are there, not
-        /// in the order of questions. A stream that breaks withdraws what still waited on it; what was granted stays with its session.
+        /// The same calls over one stream, for frequent callers: each costs a third of a separate call. Answers come when they are ready, not in the order
+        /// of questions. A stream that breaks withdraws what still waited on it; what was granted stays with its session.
         async fn session(
             &self,
             request: tonic::Request<tonic::Streaming<super::SessionRequest>>,
         ) -> std::result::Result<tonic::Response<Self::SessionStream>, tonic::Status>;
     }
-    /// Owns every resource: the operations of the paper (create, consume, delete, block, release, exists), and what makes them
-    /// usable by concurrent clients (acquire, list, watch, keep-alive). Every mutation is idempotent by its request id.
+    /// Owns every resource: the operations of the paper (create, consume, delete, block, release, exists), and what concurrent clients need besides
+    /// (acquire, list, watch, keep-alive). Every mutation is idempotent by its request id.
     #[derive(Debug)]
     pub struct ResourceServiceServer<T> {
         inner: Arc<T>,

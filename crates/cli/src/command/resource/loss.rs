@@ -52,7 +52,8 @@ fn told(update: &ResourceUpdate, lease: &Lease) -> Option<String> {
                     Some(match event.reason.as_str() {
                         // Released by its own session, or by an operator.
                         "asked" | "revoked" => format!("lease {number} was released by another"),
-                        // A lease ends with the first resource that it loses; of several this need not be the one that was deleted.
+                        "the resource is gone" => format!("`{id}` was deleted"),
+                        // A lease that loses what moves ends; of several resources this need not be the one that was deleted.
                         "a resource of it is gone" if lease.resources.len() == 1 => format!("`{id}` was deleted"),
                         reason => format!("lease {number} ended: {reason}"),
                     })
@@ -116,6 +117,9 @@ mod tests {
             Some("lease 7 ended: session expired")
         );
         assert_eq!(of(event(Deleted, "t1", None, "asked")).as_deref(), Some("`t1` was deleted"));
+        for gone in ["the resource is gone", "a resource of it is gone"] {
+            assert_eq!(of(event(Released, "t1", Some(7), gone)).as_deref(), Some("`t1` was deleted"));
+        }
         for other in [
             event(Released, "t1", Some(8), "asked"),
             event(Released, "t2", Some(8), "asked"),
