@@ -86,8 +86,9 @@ fn record_of(path: &str) -> (&'static str, &'static str) {
     }
 }
 
-/// A look for whoever may administer, and a watch of what is missing.
-const CHANGE_NOTHING: [&str; 2] = ["/ratn.v1.CellService/Save", "/ratn.v1.ResourceService/WatchDemand"];
+/// A look for whoever may administer, a watch of what is missing, and a question about an earlier request.
+const CHANGE_NOTHING: [&str; 3] =
+    ["/ratn.v1.CellService/Save", "/ratn.v1.ResourceService/WatchDemand", "/ratn.v1.ResourceService/Recall"];
 /// Their examples are several questions in one, of which only the last counts.
 const OVER_A_STREAM: [&str; 2] = ["/ratn.v1.ResourceService/Session", "/ratn.v1.WorldPoolService/Calls"];
 
