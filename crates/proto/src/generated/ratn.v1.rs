@@ -1682,7 +1682,7 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "Consume"));
             self.inner.unary(req, path, codec).await
         }
-        /// Removes resources. Leases that hold them end. NOT_FOUND if there is no such resource.
+        /// Removes a resource. Its holders lose it; a lease of a resource with a bound for standstill ends as a whole. NOT_FOUND if there is none.
         pub async fn delete(
             &mut self,
             request: impl tonic::IntoRequest<super::DeleteRequest>,
@@ -2159,7 +2159,7 @@ pub mod resource_service_server {
             &self,
             request: tonic::Request<super::ConsumeRequest>,
         ) -> std::result::Result<tonic::Response<super::ConsumeResponse>, tonic::Status>;
-        /// Removes resources. Leases that hold them end. NOT_FOUND if there is no such resource.
+        /// Removes a resource. Its holders lose it; a lease of a resource with a bound for standstill ends as a whole. NOT_FOUND if there is none.
         async fn delete(
             &self,
             request: tonic::Request<super::DeleteRequest>,
