@@ -235,7 +235,7 @@ mod tests {
     fn what_takes_away_was_not_done_where_an_older_request_is_known_and_is_refused_where_none_is() {
         use ResourceOperation::{Consume, Create, Delete};
         for operation in [of(Delete, "Box", 1), of(Consume, "Box", 1)] {
-            let ledger = ledger(&[&[of(Create, "Cup", 1)], &[operation.clone()]]);
+            let ledger = ledger(&[&[of(Create, "Cup", 1)], std::slice::from_ref(&operation)]);
             for older in 0..FIRST {
                 let settled = ledger.settle(&answers(&ledger, &[(older, Recalled::default())])).unwrap();
                 assert_eq!((settled.done.len(), settled.open.len(), settled.removals()), (0, 2, 1));

@@ -1366,7 +1366,11 @@ async fn what_a_run_deleted_of_its_own_is_what_the_manager_took_when_it_comes_ba
     run.does(create("Box", 1)).await?;
     run.does(delete("Box")).await?;
     let there = |boxes: Vec<Resource>| boxes.into_iter().map(|one| one.attributes).collect::<Vec<_>>();
-    assert_eq!(there(run.operator.list(&["Box"]).await?), [red.clone()], "the one that is like fewer others");
+    assert_eq!(
+        there(run.operator.list(&["Box"]).await?),
+        std::slice::from_ref(&red),
+        "the one that is like fewer others"
+    );
     run.comes_back().await?;
     assert_eq!(there(run.operator.list(&["Box"]).await?), [red]);
     run.bench.performer.closed().await
