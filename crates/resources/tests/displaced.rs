@@ -50,13 +50,18 @@ fn a_provider_displaces_what_a_task_made_under_its_id_and_who_holds_that_loses_i
     pool.check_invariants().unwrap();
     assert_eq!((made.owner.as_ref(), made.class), (Some(&cell), ResourceClass::Module));
     let changes = changes(&mut pool);
-    let [Change::ResourceLost { lease, session, .. }, gone, Change::ResourceCreated(there)] = changes.as_slice() else {
+    let [
+        Change::LeaseEnded { lease, session, reason: EndReason::ResourceGone, .. },
+        gone,
+        Change::ResourceCreated(there),
+    ] = changes.as_slice()
+    else {
         panic!("{changes:?}");
     };
     assert_eq!((*lease, session), (held, &bob));
     assert!(matches!(gone, Change::ResourceDeleted { reason: EndReason::Displaced, .. }), "{gone:?}");
     assert_eq!(there.owner, Some(cell.clone()));
-    assert_eq!(pool.lease(held).unwrap().resources, [], "the lease is of nothing any more");
+    assert_eq!(pool.lease(held), None);
     // Nothing of the lookalike is waited for.
     hold(&mut pool, &bob);
     assert_eq!(pool.get("arm@sim").unwrap().holders.live().next().unwrap().session, bob);
