@@ -63,17 +63,22 @@ fn bracket() -> Vec<Triangle> {
 
 /// A link that slides along x and z and is a mesh.
 fn sliding(mesh: &[Triangle]) -> Robot {
-    let slide = |name: &str, parent: &str, child: &str, axis: &str| {
+    sliding_pitched(mesh, 0.0)
+}
+
+/// A link that slides along x and z, is turned about y, and is a mesh.
+fn sliding_pitched(mesh: &[Triangle], pitch: f64) -> Robot {
+    let slide = |name: &str, parent: &str, child: &str, pitch: f64, axis: &str| {
         format!(
-            "<joint name='{name}' type='prismatic'><parent link='{parent}'/><child link='{child}'/><axis xyz='{axis}'/>\
+            "<joint name='{name}' type='prismatic'><origin rpy='0 {pitch} 0'/><parent link='{parent}'/><child link='{child}'/><axis xyz='{axis}'/>\
              <limit lower='-1' upper='2' velocity='1' effort='1'/></joint>"
         )
     };
     let urdf = format!(
         "<robot name='r'><link name='foot'/><link name='rail'/>{}{}<link name='part'><collision><geometry><mesh filename='part.stl'/></geometry>\
          </collision></link></robot>",
-        slide("x", "foot", "rail", "1 0 0"),
-        slide("z", "rail", "part", "0 0 1"),
+        slide("x", "foot", "rail", 0.0, "1 0 0"),
+        slide("z", "rail", "part", pitch, &format!("{} 0 {}", -pitch.sin(), pitch.cos())),
     );
     let toml = "name = 'r'\nurdf = 'r.urdf'\n[arm]\njoints = ['x', 'z']\ntool = 'part'\n[postures]\nhome = [0, 1]\n";
     let description = RobotDescription::read(toml).unwrap();
@@ -134,6 +139,41 @@ fn a_mesh_is_as_deep_in_a_table_as_it_is() {
     assert_eq!(depth(0.002), None);
     for depth_m in [1e-3, 5e-3] {
         assert!(depth(-depth_m).is_some_and(|found| (found - depth_m).abs() < 1e-4), "{:?}", depth(-depth_m));
+    }
+}
+
+/// A rod along z, 80 cm long and 4 cm thick, of some 20,000 triangles.
+fn rod() -> Vec<Triangle> {
+    const ROUND: usize = 32;
+    const ALONG: usize = 312;
+    let at = |i: usize, j: usize| {
+        let round = std::f64::consts::TAU * (j % ROUND) as f64 / ROUND as f64;
+        [0.02 * round.cos(), 0.02 * round.sin(), 0.8 * i as f64 / ALONG as f64 - 0.4]
+    };
+    let side = |i: usize, j: usize| {
+        let [a, b, c, d] = [at(i, j), at(i, j + 1), at(i + 1, j + 1), at(i + 1, j)];
+        [[a, b, c], [a, c, d]]
+    };
+    let ends =
+        |j: usize| [[[0.0, 0.0, -0.4], at(0, j + 1), at(0, j)], [[0.0, 0.0, 0.4], at(ALONG, j), at(ALONG, j + 1)]];
+    (0..ALONG).flat_map(|i| (0..ROUND).flat_map(move |j| side(i, j))).chain((0..ROUND).flat_map(ends)).collect()
+}
+
+#[test]
+fn either_end_of_a_fine_mesh_that_is_tilted_is_seen_in_a_table_top() {
+    let top = Furniture { name: "top".to_owned(), parts: vec![(Pose::at(0.0, 0.0, 0.48), [1.2, 0.8, 0.04])] };
+    // The lowest point of the rod is so far below its middle.
+    let below_m = (0.4 + 0.02) * std::f64::consts::FRAC_1_SQRT_2;
+    for pitch in [std::f64::consts::FRAC_PI_4, 3.0 * std::f64::consts::FRAC_PI_4] {
+        let robot = sliding_pitched(&rod(), pitch);
+        let depth = |depth_m: f64| {
+            let here = at(&robot, 0.0, 0.5 + below_m - depth_m);
+            let mut environment = Environment::new(&robot, &here, &[top.clone()], &[]);
+            environment.step(&robot, &here);
+            environment.touches().first().map(|touch| touch.depth_m)
+        };
+        assert_eq!(depth(-0.002), None, "{pitch}");
+        assert!(depth(1e-3).is_some_and(|found| (found - 1e-3).abs() < 1e-4), "{pitch}: {:?}", depth(1e-3));
     }
 }
 

@@ -15,7 +15,7 @@ use ratn_model::pose::Pose;
 use ratn_motion::mesh::Meshed;
 use ratn_motion::robot::to_f32;
 
-/// Maximum number of triangles of one comparison, or of pairs of triangles for two meshes. What is found by then counts.
+/// Maximum number of triangles near the other shape in one comparison, or of such pairs for two meshes. What is found by then counts.
 const MAX_PAIRS: usize = 4_000;
 
 /// Maximum number of corners of a mesh whose depth in another mesh is computed.
@@ -84,14 +84,16 @@ impl Surface {
         let ways: Vec<Vector> =
             other.across().into_iter().filter_map(Vector::direction).flat_map(|way| [way, -way]).collect();
         let mut open: Vec<(f64, Convex)> = Vec::new();
-        for index in self.tree.intersect_aabb(&near) {
-            let Some(left) = pairs.checked_sub(1) else { break };
-            *pairs = left;
+        let bounds: Vec<_> = ways.iter().map(|way| bound_along(*way, &at, other, within_m)).collect();
+        for index in self.tree.leaves(|node| node.aabb().intersects(&near) && reaches(&node.aabb(), &bounds)) {
             let triangle = self.triangle(index, &at);
             let at_most = deepest_along(&ways, &triangle, other);
-            if at_most >= -within_m {
-                open.push((at_most, triangle));
+            if at_most < -within_m {
+                continue;
             }
+            let Some(left) = pairs.checked_sub(1) else { break };
+            *pairs = left;
+            open.push((at_most, triangle));
         }
         open.sort_by(|(a, _), (b, _)| b.total_cmp(a));
         let mut found: Option<Meeting> = None;
@@ -198,6 +200,19 @@ fn deepest_along(ways: &[Vector], a: &Convex, b: &Convex) -> f64 {
     let between = (b.middle - a.middle).direction();
     let overlap = |way: &Vector| (a.farthest(*way) - b.farthest(-*way)).dot(*way) + a.radius + b.radius;
     ways.iter().chain(&between).map(overlap).fold(f64::INFINITY, f64::min)
+}
+
+/// A direction in the frame of a mesh, and what is to be added to how far a part of the mesh reaches along it: if the sum is negative, the part is
+/// farther from the shape than `within_m` metres.
+fn bound_along(way: Vector, at: &Pose, other: &Convex, within_m: f64) -> (Vector32, f64) {
+    let beyond = (Vector(at.position) - other.farthest(-way)).dot(way) + other.radius + within_m + ROUNDED_M;
+    (narrow(Vector(at.inverse().rotate(way.0))), beyond)
+}
+
+/// Whether a box of the tree is near the shape along each of these directions.
+fn reaches(aabb: &Aabb, bounds: &[(Vector32, f64)]) -> bool {
+    let (middle, half) = (aabb.center(), aabb.half_extents());
+    bounds.iter().all(|(way, beyond)| f64::from(middle.dot(*way) + half.dot(way.abs())) + beyond >= 0.0)
 }
 
 fn deeper(a: Meeting, b: Meeting) -> Meeting {
