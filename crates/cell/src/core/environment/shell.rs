@@ -1,7 +1,8 @@
 //! A mesh of a link as the judge sees it: its triangles as they are, not the convex pieces that the physics engine uses.
 //!
 //! It touches another shape if a triangle does, or if one is wholly inside the other. The depth is the maximum translation that one triangle, or
-//! one corner, needs to be free: so it is never more than the links need. The work of one comparison is bounded.
+//! one corner, needs to be free: so it is never more than the links need. The exact comparisons are bounded (`MAX_PAIRS`); how many triangles are
+//! passed over before is bounded by the size of the mesh alone.
 
 use super::convex::Convex;
 use super::overlap::{Meeting, meeting};
