@@ -168,7 +168,7 @@ fn either_end_of_a_fine_mesh_that_is_tilted_is_seen_in_a_table_top() {
         let robot = sliding_pitched(&rod(), pitch);
         let depth = |depth_m: f64| {
             let here = at(&robot, 0.0, 0.5 + below_m - depth_m);
-            let mut environment = Environment::new(&robot, &here, &[top.clone()], &[]);
+            let mut environment = Environment::new(&robot, &here, std::slice::from_ref(&top), &[]);
             environment.step(&robot, &here);
             environment.touches().first().map(|touch| touch.depth_m)
         };
