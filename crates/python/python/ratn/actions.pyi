@@ -92,6 +92,12 @@ class _Camera:
 
 camera: _Camera
 
+class _Detector_Confirm(ratn.State):
+    confidence: Value
+    covariance: Value
+    pose: Value
+    size: Value
+
 class _Detector_Locate(ratn.State):
     confidence: Value
     covariance: Value
@@ -102,6 +108,16 @@ class _Detector_Segment(ratn.State):
     boxes: Value
 
 class _Detector:
+    def confirm(
+        self,
+        *,
+        object: Mapping[str, Any] | Value,
+        classes: Sequence[Any] | Value = ...,
+        frames: int | Value = ...,
+        measures: Sequence[Any] | Value = ...,
+        surface_m: float | Value = ...,
+        **annotations: Unpack[Annotations],
+    ) -> _Detector_Confirm: ...
     def locate(
         self,
         *,
