@@ -151,12 +151,7 @@ fn links_meet_loose_objects_with_the_speed_that_they_have() {
 #[test]
 fn a_box_that_is_fetched_touches_only_what_it_should() {
     let mut bench = Bench::new(3, 4);
-    bench.reach_for(0);
-    bench.done(grasp());
-    bench.carry();
-    bench.done(Request::Release);
-    bench.go(vec![Goal::Joints(aimm::HOME)], 0.10, 0.0);
-    bench.pass(1.0);
+    bench.fetch_the_first_box();
     assert_eq!(bench.cell.unintended_contacts(), []);
 }
 

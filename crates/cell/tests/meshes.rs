@@ -218,12 +218,7 @@ fn a_hand_of_meshes_meets_the_demands_and_fetches_a_box_that_it_alone_touches() 
     let robot = Robot::from_file(&folder.path().join("robot.toml")).unwrap();
     assert_eq!(unmet(&robot, Setting::Boxes), []);
     let mut bench = Bench::of(config);
-    bench.reach_for(0);
-    bench.done(grasp());
-    bench.carry();
-    bench.done(Request::Release);
-    bench.go(vec![Goal::Joints(aimm::HOME)], 0.10, 0.0);
-    bench.pass(1.0);
+    bench.fetch_the_first_box();
     assert_eq!(bench.cell.unintended_contacts(), []);
 }
 

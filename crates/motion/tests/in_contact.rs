@@ -172,7 +172,7 @@ fn fingers_in_a_hollow_object_touch_nothing_that_a_retreat_leaves() {
     put_mat(&mut cell, 0.02);
     let goals = vec![Goal::Joints(aimm::OBSERVATION)];
     let into = |reaches_into: Vec<String>| Request { reaches_into, ..request(cell.state(), goals.clone()) };
-    // What is not hollow is left by a retreat, which pushes it aside in the worst case.
+    // A mat that is not hollow is left by a retreat.
     cell.plan(&into(Vec::new())).unwrap();
     let refused = cell.plan(&into(vec!["mat".to_owned()])).unwrap_err();
     assert!(matches!(refused, PlanError::StartInCollision { .. }), "{refused}");

@@ -154,6 +154,16 @@ impl Bench {
         self.go(goals, 0.0, 0.10);
     }
 
+    /// Brings the first box to where it is to go, and the arm home.
+    pub(crate) fn fetch_the_first_box(&mut self) {
+        self.reach_for(0);
+        self.done(grasp());
+        self.carry();
+        self.done(Request::Release);
+        self.go(vec![Goal::Joints(aimm::HOME)], 0.10, 0.0);
+        self.pass(1.0);
+    }
+
     /// Carries what is held to the middle of the deck, 3 mm above it; where it has to be then.
     pub(crate) fn carry(&mut self) -> Pose {
         let held = self.cell.ground_truth().into_iter().find(|object| object.held).expect("something is held");
