@@ -4,13 +4,12 @@
 
 mod bench;
 
-use bench::{Bench, grasp};
+use bench::Bench;
 use ratn_cell::config::{CellConfig, Setting};
 use ratn_cell::core::demands::unmet;
 use ratn_cell::core::environment::{Environment, Furniture, Kind, Model, STEP, Support, Thing, Touch};
 use ratn_cell::core::protocol::{Ending, Request};
 use ratn_model::pose::Pose;
-use ratn_motion::aimm;
 use ratn_motion::description::RobotDescription;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::plan::Goal;
