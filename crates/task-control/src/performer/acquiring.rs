@@ -1,7 +1,8 @@
-//! The acquires of a run without an answer, and the course of each: from the request to the resource manager to the event of its answer, or of the
-//! lease that another node of the run has handed over meanwhile.
+//! The course of an acquire: from the request to the resource manager to the event of its answer, or of the lease that another node of the run has
+//! handed over meanwhile.
 
-use super::{Answer, LONG_BESIDE_OTHERS, OVERDUE, Whom, Withdrawal};
+use super::waiting::{LONG_BESIDE_OTHERS, OVERDUE};
+use super::{Answer, Whom, Withdrawal};
 use crate::decided::{REFUSED_PATIENCE, Unanswered, insist};
 use crate::ledger::late_request;
 use crate::performer::told::Told;
@@ -16,94 +17,15 @@ use ratn_proto::v1::HolderNote;
 use ratn_worker::client::retry_until_answered;
 use ratn_worker::client::{AcquireOptions, CallError, ResourceClient};
 use ratn_worker::session::Trust;
-use std::cmp::Reverse;
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 use tokio::sync::mpsc::error::SendError;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 /// Reason code: the deadline of an acquire has passed.
 const TOO_LATE: &str = "NOT_GRANTED_IN_TIME";
-
-/// An acquire under way.
-#[derive(Debug)]
-pub(super) struct Asking {
-    pub(super) request: String,
-    /// Its number among the run's acquires.
-    pub(super) number: u64,
-    pub(super) priority: i64,
-    pub(super) requirements: Vec<Requirement>,
-    pub(super) since: Instant,
-    pub(super) withdrawn: CancellationToken,
-    /// Cancelled when nothing of the acquire is under way any more: a lease that was granted after the withdrawal has gone back, too.
-    pub(super) over: CancellationToken,
-    /// Takes a lease in place of the manager's answer; `None` once a lease was handed over.
-    pub(super) hand: Option<oneshot::Sender<Lease>>,
-}
-
-#[cfg(test)]
-impl Asking {
-    pub(super) fn for_tests(
-        number: u64,
-        requirements: Vec<Requirement>,
-        priority: i64,
-    ) -> (Asking, oneshot::Receiver<Lease>) {
-        let (hand, handed) = oneshot::channel();
-        let (since, withdrawn) = (Instant::now(), CancellationToken::new());
-        let request = format!("r/{number}");
-        let over = CancellationToken::new();
-        (Asking { request, number, priority, requirements, since, withdrawn, over, hand: Some(hand) }, handed)
-    }
-}
-
-/// All acquires under way.
-#[derive(Debug, Default)]
-pub(super) struct Waiting {
-    asking: BTreeMap<InstanceId, Asking>,
-    /// In the order in which the resource manager serves equal requests.
-    order: BTreeMap<(Reverse<i64>, u64), InstanceId>,
-}
-
-impl Waiting {
-    pub(super) fn insert(&mut self, instance: InstanceId, asking: Asking) {
-        self.remove(instance);
-        self.order.insert((Reverse(asking.priority), asking.number), instance);
-        self.asking.insert(instance, asking);
-    }
-
-    pub(super) fn remove(&mut self, instance: InstanceId) -> Option<Asking> {
-        let asking = self.asking.remove(&instance)?;
-        self.order.remove(&(Reverse(asking.priority), asking.number));
-        Some(asking)
-    }
-
-    pub(super) fn get(&self, instance: InstanceId) -> Option<&Asking> {
-        self.asking.get(&instance)
-    }
-
-    /// The waiting acquires, in the order in which they are served.
-    pub(super) fn in_order(&self) -> impl Iterator<Item = (InstanceId, &Asking)> {
-        self.order.values().filter_map(|instance| Some((*instance, self.asking.get(instance)?)))
-    }
-
-    /// The acquire that has waited longest for an answer.
-    pub(super) fn longest(&self) -> Option<(InstanceId, &Asking)> {
-        let longest = self.asking.iter().min_by_key(|(_, asking)| asking.since)?;
-        Some((*longest.0, longest.1))
-    }
-
-    /// Hands a lease to a waiting instance; `None` if the instance does not wait.
-    ///
-    /// # Errors
-    /// If it already has its answer or another lease.
-    pub(super) fn hand(&mut self, to: InstanceId, lease: &Lease) -> Option<Result<(), ()>> {
-        let hand = self.asking.get_mut(&to)?.hand.take();
-        Some(hand.ok_or(()).and_then(|hand| hand.send(lease.clone()).map_err(drop)))
-    }
-}
 
 /// A goal can be given only to a resource that says its endpoint, so the acquire of a performer's kind requires one, whoever created the resource.
 fn of_performers(catalogue: &Catalogue, requirement: &mut Requirement) {
@@ -129,7 +51,7 @@ pub(super) struct Acquiring {
     pub(super) trust: Trust,
     pub(super) told: Told,
     pub(super) whom: Whom,
-    /// Cancels [`Asking::over`] when its last clone is dropped.
+    /// Cancels [`super::waiting::Asking::over`] when its last clone is dropped.
     pub(super) over: Arc<DropGuard>,
 }
 

@@ -1,14 +1,13 @@
 //! Releases what an instance held: its lease, with a note about what the run has committed, and its projection. Each is released when nothing uses it
 //! any more and earlier decisions are on disk. Only operations wait for a release.
 
-use super::{Job, Performer};
+use super::Performer;
 use crate::decided::{Unanswered, insist};
 use crate::safe_on_disk::Mark;
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId};
 use ratn_worker::client::WorldClient;
 use ratn_worker::session::Trust;
 use ratn_worker::trace;
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 use tokio_util::sync::{CancellationToken, DropGuard};
@@ -22,12 +21,7 @@ impl Performer {
         projection: Option<ProjectionId>,
         safe: Option<Mark>,
     ) {
-        let over = |id: InstanceId, job: &Job| id == instance || (lease.is_some() && job.lease == lease);
-        let (ended, going_on): (BTreeMap<_, Job>, _) =
-            std::mem::take(&mut self.jobs).into_iter().partition(|(id, job)| over(*id, job));
-        self.jobs = going_on;
-        ended.values().for_each(|job| self.stopping.leave(job));
-        let idle = ended.into_values().map(|job| job.over).collect();
+        let idle = self.goals.leave_all(instance, lease);
         self.give_back_when(safe, instance, idle, lease, projection, None);
     }
 
@@ -58,7 +52,7 @@ impl Performer {
             self.holds.set(self.leases.has_speculative());
         }
         let (resources, world, trust) = (self.resources.clone(), self.world.clone(), self.trust.clone());
-        idle.extend(lease.into_iter().flat_map(|lease| self.stopping.under(lease)));
+        idle.extend(lease.into_iter().flat_map(|lease| self.goals.under(lease)));
         let returns = lease.map(|_| self.order.returning.begin());
         let note = self.told.left(self.decided).to_string();
         let (there, coming) = match projection.map(|id| (id, self.making.end(id))) {

@@ -11,7 +11,7 @@
 //! meanwhile, it would withdraw its request; the manager would grant the next node, which has a lease by then, too; and so on, with a resource that
 //! nobody works with.
 
-use super::acquiring::Waiting;
+use super::waiting::Waiting;
 use ratn_executive::protocol::{CERTAIN, Command, Event};
 use ratn_model::id::{InstanceId, LeaseId};
 use ratn_model::program::SUCCESS;
@@ -157,11 +157,11 @@ impl Held {
 
 #[cfg(test)]
 mod tests {
-    use super::super::acquiring::Asking;
     use super::*;
     use ratn_model::id::FencingToken;
     use ratn_model::resource::LeasedResource;
     use ratn_model::value::Value;
+    use tokio::sync::oneshot;
 
     const FIRST: InstanceId = InstanceId(1);
 
@@ -189,12 +189,21 @@ mod tests {
         Command::Acquire { instance: InstanceId(instance), requirements, priority }
     }
 
+    fn ask(
+        waiting: &mut Waiting,
+        instance: InstanceId,
+        number: u64,
+        requirements: Vec<Requirement>,
+        priority: i64,
+    ) -> oneshot::Receiver<Lease> {
+        waiting.begin(instance, number, format!("r/{number}"), requirements, priority).handed
+    }
+
     /// Waiting acquires with their priorities; the first has the id 11.
     fn waiting(all: &[(Vec<Requirement>, i64)]) -> Waiting {
         let mut waiting = Waiting::default();
         for ((requirements, priority), number) in all.iter().zip(1..) {
-            let (asking, _) = Asking::for_tests(number, requirements.clone(), *priority);
-            waiting.insert(InstanceId(10 + number), asking);
+            ask(&mut waiting, InstanceId(10 + number), number, requirements.clone(), *priority);
         }
         waiting
     }
@@ -315,13 +324,11 @@ mod tests {
     fn nothing_is_handed_to_one_that_has_its_answer() {
         let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: Vec::new(), consumed: Vec::new() };
         let mut waiting = Waiting::default();
-        let (asking, handed) = Asking::for_tests(1, planner(), 1);
-        waiting.insert(FIRST, asking);
+        let handed = ask(&mut waiting, FIRST, 1, planner(), 1);
         assert_eq!(waiting.hand(InstanceId(2), &lease), None, "it does not wait");
         drop(handed);
         assert_eq!(waiting.hand(FIRST, &lease), Some(Err(())));
-        let (asking, mut handed) = Asking::for_tests(2, planner(), 1);
-        waiting.insert(FIRST, asking);
+        let mut handed = ask(&mut waiting, FIRST, 2, planner(), 1);
         assert_eq!(waiting.hand(FIRST, &lease), Some(Ok(())));
         assert_eq!(waiting.hand(FIRST, &lease), Some(Err(())), "it has one");
         assert_eq!(handed.try_recv(), Ok(lease));

@@ -4,16 +4,19 @@
 mod acquiring;
 mod came_between;
 mod claim;
+mod closing;
 mod giving_back;
 mod goal;
+mod goals;
 mod handover;
 mod made_anew;
 mod order;
 mod resume;
-mod stopping;
+mod starting;
 #[cfg(test)]
 mod tests;
 mod told;
+mod waiting;
 mod wanted;
 mod watch;
 
@@ -22,46 +25,47 @@ pub(super) use resume::{check_world, missing_commits, remembers};
 use super::ledger::{Began, Confirmed, Projecting, acquire_request, claim_request, late_request};
 use super::outside::Outside;
 use super::promises::{Making, Promises};
-use super::record::{self, Cancelled, Decided, MAX_PENDING_RECORDS, Named, Record, Recorded, Recorder, Root};
+use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Named, Record, Recorded, Recorder, Root};
 use super::shell::{Place, Urgency};
 use crate::background_runtime::BackgroundRuntime;
 use crate::messages::Messages;
 use crate::safe_on_disk::Mark;
 use crate::waits_for::Waiting as Recording;
-use acquiring::{Acquiring, Asking, Waiting};
+use acquiring::Acquiring;
 use anyhow::{Context, bail};
 use came_between::{CameBetween, Left};
 pub(crate) use came_between::{Overtaken, Untouched};
 use claim::claim_as;
 pub use claim::{RUN_KIND, claim};
 use futures::FutureExt;
-use goal::{Given, Performing};
+use goal::Given;
+use goals::Goals;
 use handover::{Handover, Leases};
 use order::Operations;
-use ratn_executive::protocol::{CERTAIN, Command, Event, Goal, Note};
+use ratn_executive::protocol::{CERTAIN, Command, Event, Note};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, Revision};
 use ratn_model::program::Program;
-use ratn_model::resource::{LeasedResource, Requirement};
+use ratn_model::resource::Requirement;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_otlp::ids;
-use ratn_proto::types::{self, WorldChange};
+use ratn_proto::types::WorldChange;
 use ratn_worker::client::retry_unanswered;
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
 use ratn_worker::session::{DEFAULT_TTL, Session, SessionState, Standing, Trust};
 use ratn_worker::trace::{self, TraceContext};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
-use stopping::Stopping;
-use tokio::sync::{mpsc, oneshot};
-use tokio::task::{JoinHandle, JoinSet};
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::AbortOnDropHandle;
 use told::Told;
+use waiting::{Asking, Waiting, beside_others};
 use wanted::HoldsSpeculatively;
 
 /// A resource manager that does not open a session within this time counts as absent.
@@ -72,16 +76,6 @@ const ACQUIRE_DEADLINE: Duration = Duration::from_secs(3600);
 const LONG_WHILE_IDLE: Duration = Duration::from_secs(4);
 /// a wait longer than this in any case.
 const LONG: Duration = Duration::from_secs(30);
-/// A certain acquire that waits longer than this beside other runs comes next; of several, the one that has waited longest.
-const LONG_BESIDE_OTHERS: Duration = Duration::from_secs(2);
-/// The priority of such an acquire; no other acquire has it.
-const OVERDUE: i64 = i64::MAX;
-/// Time limit at the end of a run for everything that is still being recorded or given back.
-const CLOSE_DEADLINE: Duration = Duration::from_secs(3);
-/// Time limit at the end of a run for its operations, and for the leases that have to be back before something is used up or deleted: longer than an
-/// absent resource manager is waited for.
-const RETURN_DEADLINE: Duration = Duration::from_secs(15);
-
 /// Maximum length of a holder's name in characters, half of it for the task: the resource manager takes 128 unless configured otherwise.
 const MAX_HOLDER: usize = 120;
 
@@ -119,13 +113,6 @@ impl told::Ask for Whom {
         let runs = self.resources.list(&[RUN_KIND]).await.ok()?;
         Some(runs.iter().any(|other| other.id == run))
     }
-}
-
-/// The priority of an acquire among those of all runs: certain or not, then the run's urgency, then its own order.
-fn beside_others(priority: i64, urgency: Urgency) -> i64 {
-    const OWN_BITS: u32 = 60;
-    let own = (priority & (CERTAIN - 1)) >> (CERTAIN.trailing_zeros() - OWN_BITS);
-    ((priority & CERTAIN) | ((urgency as i64) << OWN_BITS) | own).min(OVERDUE - 1)
 }
 
 /// A message on its way to the executive.
@@ -211,16 +198,13 @@ pub(super) struct Performer {
     /// Cancelled when nothing may begin any more.
     over: CancellationToken,
     asking: Waiting,
-    /// Since when each instance has waited without getting what it needs, however often it asked; and its last request.
-    waiting_since: BTreeMap<InstanceId, (Instant, LastAsked)>,
     leases: Leases,
     holds: HoldsSpeculatively,
     /// The paths of the instances in the window, to name the holders of leases.
     paths: BTreeMap<InstanceId, String>,
     /// The handover by the present commands.
     handover: Option<Handover>,
-    jobs: BTreeMap<InstanceId, Job>,
-    stopping: Stopping,
+    goals: Goals,
     giving_back: JoinSet<()>,
     order: Operations,
     acquires: u64,
@@ -229,33 +213,6 @@ pub(super) struct Performer {
     resumptions: u32,
     /// The run's place in its trace.
     trace: TraceContext,
-}
-
-/// The last request of an instance.
-#[derive(Debug, Clone)]
-struct LastAsked {
-    request: String,
-    priority: i64,
-}
-
-impl LastAsked {
-    /// Its request id in the queue after this time: a certain request that has waited long is repeated under another id.
-    fn in_queue(self, waited: Duration) -> String {
-        let is_late = self.priority >= CERTAIN && waited >= LONG_BESIDE_OTHERS;
-        if is_late { late_request(&self.request) } else { self.request }
-    }
-}
-
-struct Job {
-    attempt: u32,
-    /// The lease that it works under; a routine's lease serves several jobs.
-    lease: Option<LeaseId>,
-    /// The resource that performs it; empty if there is none.
-    resource: String,
-    stop: CancellationToken,
-    ended: JoinHandle<()>,
-    /// Cancelled when it has ended.
-    over: CancellationToken,
 }
 
 impl Performer {
@@ -367,13 +324,11 @@ impl Performer {
             promises,
             making: Making::default(),
             asking: Waiting::default(),
-            waiting_since: BTreeMap::new(),
             leases: Leases::default(),
             holds,
             paths: BTreeMap::new(),
             handover: None,
-            jobs: BTreeMap::new(),
-            stopping: Stopping::default(),
+            goals: Goals::default(),
             giving_back: JoinSet::new(),
             order: Operations::default(),
             acquires: 0,
@@ -423,7 +378,7 @@ impl Performer {
                 }
                 Command::Note(Note::Retired { instance } | Note::Squashed { instance } | Note::Merged { instance }) => {
                     self.paths.remove(instance);
-                    self.waiting_since.remove(instance);
+                    self.asking.forget(*instance);
                 }
                 _ => {}
             }
@@ -469,7 +424,7 @@ impl Performer {
                 self.acquire(instance, self.acquires, requirements, priority);
             }
             Command::Withdraw { instance } => {
-                if let Some(asking) = self.asking.remove(instance) {
+                if let Some(asking) = self.asking.withdraw(instance) {
                     self.order.returning.add(asking.over);
                     asking.withdrawn.cancel();
                 }
@@ -481,12 +436,11 @@ impl Performer {
             Command::Start { instance, attempt, goal } => {
                 self.start(instance, attempt, *goal, Given::Now, safe);
             }
-            Command::Cancel { instance, attempt } => match self.jobs.get(&instance) {
-                Some(job) if job.attempt == attempt => self.stopping.stop(job),
-                _ => {
+            Command::Cancel { instance, attempt } => {
+                if !self.goals.cancel(instance, attempt) {
                     self.cancelled.lock().unwrap_or_else(PoisonError::into_inner).insert((instance, attempt));
                 }
-            },
+            }
             Command::Release { instance, lease, projection } => {
                 let goes_back = |id: &LeaseId| self.handover.as_ref().is_none_or(|handover| handover.lease.id != *id);
                 let lease = lease.filter(goes_back);
@@ -511,64 +465,6 @@ impl Performer {
     /// The run is over, or has failed: what has not begun does not begin any more.
     pub(super) fn begin_no_more(&self) {
         self.over.cancel();
-    }
-
-    /// Waits until all decisions are recorded and all leases given back, and ends the session. Returns the events that the executive has not been
-    /// told by then: how far the run's operations are done, and whose effects failed first. An error if a decision is not recorded: the world pool or
-    /// the resource manager then know less than what happened.
-    pub(super) async fn close(self) -> (Vec<Event>, anyhow::Result<()>) {
-        let (heard, session, recorded) = (self.heard, self.number, Arc::clone(&self.recorded));
-        let closed = self.end().await;
-        let Confirmed { operation, failed, .. } = *recorded.borrow();
-        let done = (operation > heard.operation).then(|| record::recorded(operation, session, Vec::new()));
-        let failed = failed.filter(|_| heard.failed.is_none()).map(|(instance, unmade)| {
-            let reason = closed.as_ref().err().map_or_else(String::new, ToString::to_string);
-            Event::RetirementFailed { instance, reason, unmade }
-        });
-        (done.into_iter().chain(failed).collect(), closed)
-    }
-
-    async fn end(mut self) -> anyhow::Result<()> {
-        self.begin_no_more();
-        let recording = async {
-            let (done, recorded) = oneshot::channel();
-            self.records.send(Record::Flush(done)).await.map_err(|_| "the recorder is gone".to_owned())?;
-            recorded.await.unwrap_or_else(|_| Err("the recorder is gone".to_owned()))
-        };
-        // An operation waits for the leases that go back before it, and all of them perhaps for an absent resource manager.
-        let operating = self.order.operating.all();
-        let mut before = if operating.is_empty() { Vec::new() } else { self.order.returning.all() };
-        before.extend(operating);
-        let in_time = async {
-            let operated = async {
-                for one in &before {
-                    one.cancelled().await;
-                }
-            };
-            tokio::select! {
-                () = operated => {}
-                () = self.session.gone() => {}
-                () = tokio::time::sleep(RETURN_DEADLINE) => {}
-            }
-            tokio::time::sleep(CLOSE_DEADLINE).await;
-        };
-        let recorded = tokio::select! {
-            recorded = recording => Ok(recorded),
-            () = in_time => Err(self.recording.get()),
-        };
-        let giving_back = async { while self.giving_back.join_next().await.is_some() {} };
-        if tokio::time::timeout(CLOSE_DEADLINE, giving_back).await.is_err() {
-            tracing::warn!("what was left at the end of the run was not given back in time");
-        }
-        // Whoever gets the resources now changes the world; what was not recorded in time is never recorded.
-        self.recorder.abort();
-        let _ = self.recorder.await;
-        self.session.close().await;
-        match recorded {
-            Ok(Ok(())) => Ok(()),
-            Ok(Err(reason)) => bail!("what the run did is not all recorded: {reason}"),
-            Err(waits_for) => bail!("what the run did is not all recorded: {waits_for}"),
-        }
     }
 
     fn record(&self, record: Record) -> anyhow::Result<()> {
@@ -619,41 +515,33 @@ impl Performer {
     }
 
     fn acquire(&mut self, instance: InstanceId, number: u64, requirements: Vec<Requirement>, priority: i64) {
-        let (withdrawn, over) = (CancellationToken::new(), CancellationToken::new());
-        let ends = Arc::new(over.clone().drop_guard());
-        let (hand, handed) = oneshot::channel();
         let request = acquire_request(&self.run, instance, number, self.resumptions);
-        let since = Instant::now();
-        let before = self.waiting_since.get(&instance).cloned();
-        let began = before.as_ref().map_or(since, |(began, _)| *began);
-        let waited = began.elapsed();
-        self.waiting_since.insert(instance, (began, LastAsked { request: request.clone(), priority }));
-        let options = AcquireOptions {
-            request: request.clone(),
-            priority: beside_others(priority, self.urgency),
-            speculative: priority < CERTAIN,
-            instead_of: before.map_or_else(String::new, |(_, last)| last.in_queue(waited)),
-            deadline: ACQUIRE_DEADLINE,
-            holder: holder(&self.program.name, self.paths.get(&instance).map_or(&instance.to_string(), |path| path)),
-        };
-        let asked = requirements.clone();
-        let (hand, withdrawal) = (Some(hand), withdrawn.clone());
-        self.asking.insert(instance, Asking { request, number, priority, requirements, since, withdrawn, over, hand });
+        let course = self.asking.begin(instance, number, request.clone(), requirements.clone(), priority);
         if let Some(handover) = self.handover.as_ref().filter(|one| one.to == instance && !one.waits) {
             let _ = self.asking.hand(instance, &handover.lease);
         }
         let acquiring = Acquiring {
             instance,
-            requirements: asked,
+            requirements,
             catalogue: self.catalogue.clone(),
-            options,
-            waited,
+            options: AcquireOptions {
+                request,
+                priority: beside_others(priority, self.urgency),
+                speculative: priority < CERTAIN,
+                instead_of: course.instead_of,
+                deadline: ACQUIRE_DEADLINE,
+                holder: holder(
+                    &self.program.name,
+                    self.paths.get(&instance).map_or(&instance.to_string(), |path| path),
+                ),
+            },
+            waited: course.waited,
             after: self.order.operating.all(),
-            withdrawn: withdrawal,
-            handed,
+            withdrawn: course.withdrawn,
+            handed: course.handed,
             resources: self.resources.clone(),
             trust: self.trust.clone(),
-            over: ends,
+            over: course.over,
             told: self.told.clone(),
             whom: Whom { resources: self.resources.clone(), world: self.world.clone(), told: self.told.clone() },
         };
@@ -666,8 +554,7 @@ impl Performer {
 
     /// The instance that has waited longest for resources, if that is longer than an observer of the run expects.
     pub(super) fn waits(&self) -> Option<InstanceId> {
-        let idle = self.jobs.values().all(|job| job.ended.is_finished());
-        let bound = if idle { LONG_WHILE_IDLE } else { LONG };
+        let bound = if self.goals.are_idle() { LONG_WHILE_IDLE } else { LONG };
         let (instance, longest) = self.asking.longest()?;
         (longest.since.elapsed() >= bound).then_some(instance)
     }
@@ -727,8 +614,7 @@ impl Performer {
             Event::Crashed { instance, attempt, .. } if self.was_cancelled(instance, attempt) => None,
             event => {
                 if let Event::Granted { instance, .. } | Event::Refused { instance, .. } = &event {
-                    let asked = self.asking.remove(*instance);
-                    self.waiting_since.remove(instance);
+                    let asked = self.asking.answered(*instance);
                     if let Some(between) = &mut self.came_between {
                         between.event(&event, self.told.revision());
                     }
@@ -748,9 +634,7 @@ impl Performer {
                 if let Event::Crashed { instance, attempt, .. } = &event {
                     // If the world pool was started again, it has promised nothing.
                     self.promises.forget();
-                    if let Some(job) = self.jobs.get(instance).filter(|job| job.attempt == *attempt) {
-                        self.stopping.stop(job);
-                    }
+                    self.goals.cancel(*instance, *attempt);
                 }
                 Some(event)
             }
@@ -764,90 +648,5 @@ impl Performer {
 
     fn was_cancelled(&self, instance: InstanceId, attempt: u32) -> bool {
         self.cancelled.lock().unwrap_or_else(PoisonError::into_inner).remove(&(instance, attempt))
-    }
-
-    /// Gives a goal to its provider, or waits for one that was given before.
-    fn start(&mut self, instance: InstanceId, attempt: u32, goal: Goal, given: Given, safe: Option<Mark>) {
-        let stop = CancellationToken::new();
-        let lease = goal.lease.as_ref().map(|lease| lease.id);
-        let provider = self.provider_of(&goal);
-        let (source, endpoint) = match provider {
-            Ok(resource) => (
-                resource.id.clone(),
-                resource.endpoint.parse().map_err(|error| format!("{} has no usable endpoint: {error}", resource.id)),
-            ),
-            Err(reason) => (String::new(), Err(reason)),
-        };
-        let (resource, over) = (source.clone(), CancellationToken::new());
-        let before = if given == Given::Now { self.stopping.before(&source) } else { Vec::new() };
-        // A goal without a projection reads the root, which has to contain every earlier decision; unless the goal reads no facts.
-        let looks_at_root = given != Given::ToStop && goal.projection.is_none() && !goal.reads_nothing;
-        let sees = looks_at_root.then(|| (self.recorded.subscribe(), self.decided));
-        let performing = Performing {
-            instance,
-            attempt,
-            before,
-            endpoint,
-            source,
-            timeout_s: goal.timeout_s,
-            speed: self.speed,
-            actions: self.actions.clone(),
-            resources: self.resources.clone(),
-            channels: self.channels.clone(),
-            events: self.events.clone(),
-            stop: stop.clone(),
-            results: Mutex::default(),
-            outputs: self.outputs_of(&goal),
-            safe,
-            sees,
-            over: self.over.clone(),
-            told: self.told.clone(),
-            goal: types::Goal {
-                id: format!("{}/{instance}/{attempt}", self.run),
-                action: goal.action.to_string(),
-                inputs: goal.inputs,
-                seed: goal.seed,
-                lease: goal.lease,
-                session: self.run.clone(),
-                projection: goal.projection,
-                world_pool: self.world.endpoint().to_string(),
-                deadline_ms: goal::deadline_ms(goal.timeout_s, self.speed),
-                grace_ms: goal::GRACE_MS,
-                improves: goal.improves.map(Vec::from),
-            },
-        };
-        let ends = over.clone().drop_guard();
-        let performing = async move {
-            performing.perform(given).await;
-            drop(ends);
-        };
-        let ended = tokio::spawn(trace::within(self.of(instance), performing));
-        let job = Job { attempt, lease, resource, stop, ended, over };
-        if given == Given::ToStop {
-            return self.stopping.stop(&job);
-        }
-        let before = self.jobs.insert(instance, job);
-        before.iter().for_each(|job| self.stopping.leave(job));
-    }
-
-    /// The output ports that a result of the goal's action must have.
-    fn outputs_of(&self, goal: &Goal) -> Vec<String> {
-        let provider = self.catalogue.providers.get(&*goal.provider);
-        let action = provider.and_then(|provider| provider.actions.get(&*goal.action));
-        action.map(|action| action.outputs.keys().cloned().collect()).unwrap_or_default()
-    }
-
-    /// The provider of a goal: the leased resource of its kind.
-    fn provider_of<'a>(&self, goal: &'a Goal) -> Result<&'a LeasedResource, String> {
-        let Some(provider) = self.catalogue.providers.get(&*goal.provider) else {
-            return Err(format!("the system's catalogue has no provider `{}`", goal.provider));
-        };
-        let leased = goal.lease.as_ref().and_then(|lease| lease.resource(&provider.resource));
-        leased.ok_or_else(|| {
-            format!(
-                "`{}` is done by a {}, and none is leased: add `block: {}` to the state's resources",
-                goal.provider, provider.resource, provider.resource
-            )
-        })
     }
 }

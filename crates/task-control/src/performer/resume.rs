@@ -395,7 +395,7 @@ impl Performer {
             let (resources, trust) = (self.resources.clone(), self.trust.clone());
             let note = self.told.left(self.decided).to_string();
             self.left.goes_back(self.decided, self.confirmed().commit, Instant::now());
-            let (idle, returns) = (self.stopping.under(lease), self.order.returning.begin());
+            let (idle, returns) = (self.goals.under(lease), self.order.returning.begin());
             self.giving_back.spawn(async move {
                 for goal in idle {
                     goal.cancelled().await;

@@ -1,0 +1,99 @@
+//! Starts the goal of a state: at which provider, under which lease, and behind which other goals and decisions.
+
+use super::Performer;
+use super::goal::{self, Given, Performing};
+use super::goals::Job;
+use crate::safe_on_disk::Mark;
+use ratn_executive::protocol::Goal;
+use ratn_model::id::InstanceId;
+use ratn_model::resource::LeasedResource;
+use ratn_proto::types;
+use ratn_worker::trace;
+use std::sync::Mutex;
+use tokio_util::sync::CancellationToken;
+
+impl Performer {
+    /// Gives a goal to its provider, or waits for one that was given before.
+    pub(super) fn start(&mut self, instance: InstanceId, attempt: u32, goal: Goal, given: Given, safe: Option<Mark>) {
+        let stop = CancellationToken::new();
+        let lease = goal.lease.as_ref().map(|lease| lease.id);
+        let provider = self.provider_of(&goal);
+        let (source, endpoint) = match provider {
+            Ok(resource) => (
+                resource.id.clone(),
+                resource.endpoint.parse().map_err(|error| format!("{} has no usable endpoint: {error}", resource.id)),
+            ),
+            Err(reason) => (String::new(), Err(reason)),
+        };
+        let (resource, over) = (source.clone(), CancellationToken::new());
+        let before = if given == Given::Now { self.goals.before(&source) } else { Vec::new() };
+        // A goal without a projection reads the root, which has to contain every earlier decision; unless the goal reads no facts.
+        let looks_at_root = given != Given::ToStop && goal.projection.is_none() && !goal.reads_nothing;
+        let sees = looks_at_root.then(|| (self.recorded.subscribe(), self.decided));
+        let performing = Performing {
+            instance,
+            attempt,
+            before,
+            endpoint,
+            source,
+            timeout_s: goal.timeout_s,
+            speed: self.speed,
+            actions: self.actions.clone(),
+            resources: self.resources.clone(),
+            channels: self.channels.clone(),
+            events: self.events.clone(),
+            stop: stop.clone(),
+            results: Mutex::default(),
+            outputs: self.outputs_of(&goal),
+            safe,
+            sees,
+            over: self.over.clone(),
+            told: self.told.clone(),
+            goal: types::Goal {
+                id: format!("{}/{instance}/{attempt}", self.run),
+                action: goal.action.to_string(),
+                inputs: goal.inputs,
+                seed: goal.seed,
+                lease: goal.lease,
+                session: self.run.clone(),
+                projection: goal.projection,
+                world_pool: self.world.endpoint().to_string(),
+                deadline_ms: goal::deadline_ms(goal.timeout_s, self.speed),
+                grace_ms: goal::GRACE_MS,
+                improves: goal.improves.map(Vec::from),
+            },
+        };
+        let ends = over.clone().drop_guard();
+        let performing = async move {
+            performing.perform(given).await;
+            drop(ends);
+        };
+        let ended = tokio::spawn(trace::within(self.of(instance), performing));
+        let job = Job { attempt, lease, resource, stop, ended, over };
+        if given == Given::ToStop {
+            return self.goals.stop(&job);
+        }
+        self.goals.awaits(instance, job);
+    }
+
+    /// The output ports that a result of the goal's action must have.
+    fn outputs_of(&self, goal: &Goal) -> Vec<String> {
+        let provider = self.catalogue.providers.get(&*goal.provider);
+        let action = provider.and_then(|provider| provider.actions.get(&*goal.action));
+        action.map(|action| action.outputs.keys().cloned().collect()).unwrap_or_default()
+    }
+
+    /// The provider of a goal: the leased resource of its kind.
+    fn provider_of<'a>(&self, goal: &'a Goal) -> Result<&'a LeasedResource, String> {
+        let Some(provider) = self.catalogue.providers.get(&*goal.provider) else {
+            return Err(format!("the system's catalogue has no provider `{}`", goal.provider));
+        };
+        let leased = goal.lease.as_ref().and_then(|lease| lease.resource(&provider.resource));
+        leased.ok_or_else(|| {
+            format!(
+                "`{}` is done by a {}, and none is leased: add `block: {}` to the state's resources",
+                goal.provider, provider.resource, provider.resource
+            )
+        })
+    }
+}

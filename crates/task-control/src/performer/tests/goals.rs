@@ -1,0 +1,198 @@
+//! Goals of the run: what they wait for, and what waits for their end.
+
+use super::*;
+
+#[tokio::test]
+async fn who_comes_back_tells_a_goal_to_stop_that_may_not_have_been_told() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (routine, motion) = (InstanceId(1), InstanceId(2));
+    bench.ask(routine)?;
+    let lease = bench.granted(routine).await?;
+    let (arm, endpoint) = serve_arm(&mut bench).await?;
+    let started = start(motion, 1, "brake", lease, &endpoint);
+    bench.performer.perform(started.clone())?;
+    while arm.running() == 0 {
+        tokio::task::yield_now().await;
+    }
+    // Task control is killed when it has logged the cancel and before it has sent it to the arm.
+    let run = bench.performer.run.clone();
+    let acquire = Command::Acquire { instance: routine, requirements: self::arm(), priority: 0 };
+    let mut ledger = ledger(&run, &[]);
+    ledger.command(&acquire);
+    let resource =
+        LeasedResource { id: "arm".into(), kind: "Arm".into(), endpoint: endpoint.clone(), superclasses: Vec::new() };
+    let held = Lease { id: lease, token: FencingToken(1), resources: vec![resource], consumed: Vec::new() };
+    ledger.event(Timestamp(0), &Event::Granted { instance: routine, lease: held });
+    ledger.command(&started);
+    ledger.command(&Command::Cancel { instance: motion, attempt: 1 });
+    ledger.event(Timestamp(0), &Event::Resumed { share: None });
+    let catalogue = bench.performer.catalogue.clone();
+    let mut bench = bench.comes_back(true).await?;
+    bench.performer.catalogue = catalogue;
+    bench.takes_up(ledger, &World::default()).await?;
+    // The next goal of that arm is sent when the arm stands still.
+    bench.performer.perform(start(InstanceId(3), 1, "work", lease, &endpoint))?;
+    let event = bench.event().await;
+    assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == SUCCESS), "{event:?}");
+    assert_eq!(arm.running(), 0);
+    bench.performer.closed().await
+}
+
+#[tokio::test]
+async fn a_lease_goes_back_when_every_goal_under_it_has_ended() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (routine, motion, other) = (InstanceId(1), InstanceId(2), InstanceId(3));
+    let (events, mut answers) = mpsc::channel(8);
+    let mut second = connect(&bench.endpoints, "second", events).await?;
+    bench.ask(routine)?;
+    let lease = bench.granted(routine).await?;
+    let (arm, endpoint) = serve_arm(&mut bench).await?;
+    // A motion of the routine loses a race: it is cancelled, its projection goes back, and the routine ends.
+    bench.performer.perform(start(motion, 1, "brake", lease, &endpoint))?;
+    while arm.running() == 0 {
+        tokio::task::yield_now().await;
+    }
+    second.perform(Command::Acquire { instance: other, requirements: self::arm(), priority: 0 })?;
+    let projection = Some(ProjectionId(999));
+    for command in [
+        Command::Cancel { instance: motion, attempt: 1 },
+        Command::Release { instance: motion, lease: None, projection },
+        Command::Release { instance: routine, lease: Some(lease), projection: None },
+    ] {
+        bench.performer.perform(command)?;
+    }
+    granted_after(&mut second, &mut answers).await?;
+    assert_eq!(arm.running(), 0, "whoever gets the arm finds it idle");
+    second.closed().await?;
+    bench.performer.closed().await
+}
+
+#[tokio::test]
+async fn a_goal_waits_for_one_of_the_same_resource_that_was_told_to_stop() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (arm, endpoint) = serve_arm(&mut bench).await?;
+    let start = |instance, attempt, action: &str| start(instance, attempt, action, LeaseId(1), &endpoint);
+    for round in 0..20 {
+        let (first, second, third) = (InstanceId(3 * round + 1), InstanceId(3 * round + 2), InstanceId(3 * round + 3));
+        bench.performer.perform(start(first, 1, "hang"))?;
+        while arm.running() == 0 {
+            tokio::task::yield_now().await;
+        }
+        // A goal that a limit cuts short, and a goal on the way out, which is cut short in turn and tried again.
+        bench.performer.perform(Command::Cancel { instance: first, attempt: 1 })?;
+        bench.performer.perform(start(second, 1, "hang"))?;
+        bench.performer.perform(Command::Cancel { instance: second, attempt: 1 })?;
+        bench.performer.perform(start(second, 2, "work"))?;
+        let event = bench.event().await;
+        assert!(
+            matches!(&event, Some(Event::Finished { instance, attempt: 2, outcome, .. })
+                if *instance == second && outcome == SUCCESS),
+            "round {round}: {event:?}"
+        );
+        bench.performer.perform(start(third, 1, "work"))?;
+        let event = bench.event().await;
+        assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == SUCCESS), "{event:?}");
+    }
+    bench.performer.closed().await
+}
+
+#[tokio::test]
+async fn a_goal_without_a_projection_begins_when_what_was_decided_before_it_is_in_the_root() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let [first, second, third] = [1, 2, 3].map(InstanceId);
+    bench.ask(first)?;
+    let lease = bench.granted(first).await?;
+    let (_arm, endpoint) = serve_arm(&mut bench).await?;
+    let work = |instance| start(instance, 1, "work", lease, &endpoint);
+    let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
+    // The commit is under way for long.
+    let (disk, slow) = Mark::not_yet();
+    let commit = Command::Commit {
+        instance: first,
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(1),
+    };
+    bench.performer.perform_when(Some(slow), commit)?;
+    bench.performer.perform(work(first))?;
+    // A goal that is cancelled meanwhile is never given; a goal with a projection does not wait.
+    bench.performer.perform(work(second))?;
+    bench.performer.perform(Command::Cancel { instance: second, attempt: 1 })?;
+    let Command::Start { instance, attempt, mut goal } = work(third) else { bail!("it is a start") };
+    goal.projection = Some(ProjectionId(999));
+    bench.performer.perform(Command::Start { instance, attempt, goal })?;
+    let event = bench.event().await;
+    assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == third), "{event:?}");
+    let early = tokio::time::timeout(Duration::from_millis(200), bench.event()).await;
+    assert!(early.is_err(), "{early:?}");
+    assert_eq!(world.root().await?.0, Revision(0));
+    disk.send_replace(1);
+    let event = bench.event().await;
+    assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == first), "{event:?}");
+    assert_eq!(world.root().await?.1.len(), 1);
+    bench.performer.closed().await
+}
+
+#[tokio::test]
+async fn a_goal_of_before_that_was_never_given_waits_for_what_was_decided_before_it() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (first, second) = (InstanceId(1), InstanceId(2));
+    let (_arm, endpoint) = serve_arm(&mut bench).await?;
+    // The arm is offered in a session with a short time to live, which soon proves whether it is the same.
+    let channels = Channels::new(&ClientTls::none());
+    let manager = bench.endpoints.resource_manager.clone();
+    let robot = Session::open(&channels, &manager, "brief", Duration::from_secs(1));
+    robot.alive(SESSION_DEADLINE).await?;
+    let offering = ResourceClient::new(&channels, &manager, robot.id())?;
+    offering.create(Resource::new("brief-arm", ResourceClass::Module, "BriefArm")).await?;
+    let requirements = vec![Requirement::new(ResourceOperation::Block, "BriefArm")];
+    bench.performer.perform(Command::Acquire { instance: first, requirements, priority: 0 })?;
+    let lease = bench.granted(first).await?;
+    let goal = |instance| {
+        let Command::Start { mut goal, .. } = start(instance, 1, "work", lease, &endpoint) else {
+            unreachable!("it is a start")
+        };
+        if let Some(lease) = &mut goal.lease {
+            lease.resources[0].id = "brief-arm".to_owned();
+        }
+        *goal
+    };
+    // The commit is under way for long; the log says that both goals were given, and the provider knows neither.
+    let (disk, slow) = Mark::not_yet();
+    bench.performer.perform_when(Some(slow), commits(1, 1))?;
+    bench.performer.start(first, 1, goal(first), Given::Before, None);
+    bench.performer.start(second, 1, Goal { reads_nothing: true, ..goal(second) }, Given::Before, None);
+    let event = bench.event().await;
+    assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == second), "{event:?}");
+    let early = tokio::time::timeout(Duration::from_secs(1), bench.event()).await;
+    assert!(early.is_err(), "{early:?}");
+    disk.send_replace(1);
+    let event = bench.event().await;
+    assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == first), "{event:?}");
+    bench.performer.closed().await
+}
+
+#[tokio::test]
+async fn a_motion_that_reads_nothing_does_not_wait_for_what_was_decided_before_it() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (first, second) = (InstanceId(1), InstanceId(2));
+    bench.ask(first)?;
+    let lease = bench.granted(first).await?;
+    let (_arm, endpoint) = serve_arm(&mut bench).await?;
+    let (disk, slow) = Mark::not_yet();
+    bench.performer.perform_when(Some(slow), commits(1, 1))?;
+    for (instance, reads_nothing) in [(first, false), (second, true)] {
+        let Command::Start { attempt, goal, .. } = start(instance, 1, "work", lease, &endpoint) else {
+            bail!("it is a start")
+        };
+        let goal = Box::new(Goal { reads_nothing, ..*goal });
+        bench.performer.perform(Command::Start { instance, attempt, goal })?;
+    }
+    for expected in [second, first] {
+        let event = bench.event().await;
+        assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == expected), "{event:?}");
+        disk.send_replace(1);
+    }
+    bench.performer.closed().await
+}
