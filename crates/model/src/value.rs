@@ -211,6 +211,24 @@ impl Type {
         }
     }
 
+    /// A value that this type accepts, with each int that stands for a float as that float.
+    pub fn widened(&self, value: Value) -> Value {
+        match (self, value) {
+            (Type::Float, Value::Int(int)) => Value::Float(int as f64),
+            (Type::List(element), Value::List(values)) => {
+                Value::List(values.into_iter().map(|value| element.widened(value)).collect())
+            }
+            (Type::Map(element), Value::Map(fields)) => {
+                Value::Map(fields.into_iter().map(|(name, value)| (name, element.widened(value))).collect())
+            }
+            (Type::Record(types), Value::Map(fields)) => {
+                let of = |name: &String| types.get(name).unwrap_or(&Type::Any);
+                Value::Map(fields.into_iter().map(|(name, value)| (name.clone(), of(&name).widened(value))).collect())
+            }
+            (_, value) => value,
+        }
+    }
+
     /// Whether a value of type `from` may flow into a port of this type; `any` fits both ways and is checked at run time.
     pub fn accepts_type(&self, from: &Type) -> bool {
         match (self, from) {
@@ -421,5 +439,16 @@ mod tests {
     fn an_int_flows_into_a_float_but_not_back() {
         assert!(Type::Float.accepts_type(&Type::Int));
         assert!(!Type::Int.accepts_type(&Type::Float));
+    }
+
+    #[test]
+    fn an_int_in_the_place_of_a_float_is_widened_also_within_lists_and_records() {
+        let value = |number: fn(i64) -> Value| {
+            let times = Value::List(vec![number(1), Value::Float(0.5)].into());
+            Value::map([("shots", Value::Int(3)), ("times", times), ("more", Value::map([("a", number(-2))]))])
+        };
+        let ty = "{shots: int, times: list<float>, more: map<float>}".parse::<Type>();
+        assert_eq!(ty.map(|ty| ty.widened(value(Value::Int))), Ok(value(|int| Value::Float(int as f64))));
+        assert_eq!(Type::Any.widened(Value::Int(1)), Value::Int(1));
     }
 }

@@ -7,8 +7,10 @@ use crate::safe_on_disk::Mark;
 use ratn_executive::protocol::Goal;
 use ratn_model::id::InstanceId;
 use ratn_model::resource::LeasedResource;
+use ratn_model::value::{Type, Value};
 use ratn_proto::types;
 use ratn_worker::trace;
+use std::collections::BTreeMap;
 use std::sync::Mutex;
 use tokio_util::sync::CancellationToken;
 
@@ -30,6 +32,7 @@ impl Performer {
         // A goal without a projection reads the root, which has to contain every earlier decision; unless the goal reads no facts.
         let looks_at_root = given != Given::ToStop && goal.projection.is_none() && !goal.reads_nothing;
         let sees = looks_at_root.then(|| (self.recorded.subscribe(), self.decided));
+        let (inputs, outputs) = self.ports_of(&goal);
         let performing = Performing {
             instance,
             attempt,
@@ -44,7 +47,7 @@ impl Performer {
             events: self.events.clone(),
             stop: stop.clone(),
             results: Mutex::default(),
-            outputs: self.outputs_of(&goal),
+            outputs,
             safe,
             sees,
             over: self.over.clone(),
@@ -52,7 +55,7 @@ impl Performer {
             goal: types::Goal {
                 id: format!("{}/{instance}/{attempt}", self.run),
                 action: goal.action.to_string(),
-                inputs: goal.inputs,
+                inputs,
                 seed: goal.seed,
                 lease: goal.lease,
                 session: self.run.clone(),
@@ -76,11 +79,17 @@ impl Performer {
         self.goals.awaits(instance, job);
     }
 
-    /// The output ports that a result of the goal's action must have.
-    fn outputs_of(&self, goal: &Goal) -> Vec<String> {
+    /// The inputs of a goal in the types of its action's ports, and the output ports that a result must have.
+    pub(super) fn ports_of(&self, goal: &Goal) -> (BTreeMap<String, Value>, Vec<String>) {
         let provider = self.catalogue.providers.get(&*goal.provider);
-        let action = provider.and_then(|provider| provider.actions.get(&*goal.action));
-        action.map(|action| action.outputs.keys().cloned().collect()).unwrap_or_default()
+        let Some(action) = provider.and_then(|provider| provider.actions.get(&*goal.action)) else {
+            return (goal.inputs.clone(), Vec::new());
+        };
+        let typed = |(port, value): (&String, &Value)| {
+            let ty = action.inputs.get(port).or_else(|| action.optional.get(port)).unwrap_or(&Type::Any);
+            (port.clone(), ty.widened(value.clone()))
+        };
+        (goal.inputs.iter().map(typed).collect(), action.outputs.keys().cloned().collect())
     }
 
     /// The provider of a goal: the leased resource of its kind.

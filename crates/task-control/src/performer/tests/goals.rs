@@ -1,6 +1,8 @@
 //! Goals of the run: what they wait for, and what waits for their end.
 
 use super::*;
+use ratn_model::catalogue::ActionSignature;
+use ratn_model::value::{Type, Value};
 
 #[tokio::test]
 async fn who_comes_back_tells_a_goal_to_stop_that_may_not_have_been_told() -> anyhow::Result<()> {
@@ -194,5 +196,22 @@ async fn a_motion_that_reads_nothing_does_not_wait_for_what_was_decided_before_i
         assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == expected), "{event:?}");
         disk.send_replace(1);
     }
+    bench.performer.closed().await
+}
+
+#[tokio::test]
+async fn an_int_for_a_float_port_reaches_the_provider_as_a_float() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let action = ActionSignature { inputs: [("exposure_s".to_owned(), Type::Float)].into(), ..Default::default() };
+    let actions = [("photo".to_owned(), action)].into();
+    let provider = Provider { resource: "Arm".to_owned(), joints: None, chain: None, actions };
+    bench.performer.catalogue =
+        Arc::new(Catalogue { providers: [("arm".to_owned(), provider)].into(), ..Catalogue::default() });
+    let Command::Start { mut goal, .. } = start(InstanceId(1), 1, "photo", LeaseId(1), "") else {
+        bail!("it is a start")
+    };
+    goal.inputs = [("exposure_s".to_owned(), Value::Int(2))].into();
+    let (inputs, _) = bench.performer.ports_of(&goal);
+    assert_eq!(inputs, [("exposure_s".to_owned(), Value::Float(2.0))].into());
     bench.performer.closed().await
 }
