@@ -69,7 +69,7 @@ fn record_of(path: &str) -> (&'static str, &'static str) {
         "ProcessService/Restart" => ("restart", r#""target":"a""#),
         "ProcessService/Scale" => ("scale", r#""template":"a""#),
         "ProcessService/Drain" => ("drain", r#""undo":"#),
-        "ActionService/Execute" | "ActionService/Perform" => ("goal", r#""goal":"a""#),
+        "ActionService/Execute" | "ActionService/Attach" | "ActionService/Perform" => ("goal", r#""goal":"a""#),
         "ActionService/Cancel" => ("cancel", r#""goal":"a""#),
         "SafetyService/EmergencyStop" => ("emergency_stop", r#""reason":"a""#),
         "SafetyService/ClearEmergencyStop" => ("clear_emergency_stop", ""),

@@ -79,7 +79,7 @@ impl Holder {
 async fn give(lease: v1::Lease, action: &str, goal_id: String) -> anyhow::Result<Result<String, Status>> {
     let endpoint: Endpoint = lease.resources.first().context("a resource")?.endpoint.parse()?;
     let goal = v1::Goal { goal_id, action: action.to_owned(), lease: Some(lease), ..Default::default() };
-    let request = v1::ExecuteRequest { goal: Some(goal), known_only: false };
+    let request = v1::ExecuteRequest { goal: Some(goal) };
     let mut heard = match ActionServiceClient::new(connect(&endpoint, &ClientTls::none()).await?).execute(request).await
     {
         Ok(heard) => heard.into_inner(),

@@ -172,7 +172,7 @@ impl Cell {
     /// What is answered to one question, without being patient.
     async fn ask(&self, goal: Goal) -> Result<v1::GoalResult, Status> {
         let mut client = ActionServiceClient::new(connect(&self.endpoint, &ClientTls::none()).await.unwrap());
-        let question = v1::ExecuteRequest { goal: Some(goal.into()), known_only: false };
+        let question = v1::ExecuteRequest { goal: Some(goal.into()) };
         let mut told = client.execute(question).await?.into_inner();
         loop {
             if let Some(v1::execute_response::Kind::Result(result)) = told.message().await?.unwrap().kind {

@@ -10,8 +10,8 @@ use ratn_proto::v1::action_service_server::{ActionService, ActionServiceServer};
 use ratn_proto::v1::perform_request::Kind as Asked;
 use ratn_proto::v1::perform_response::Kind as Heard;
 use ratn_proto::v1::{
-    CancelRequest, CancelResponse, DescribeRequest, DescribeResponse, ExecuteRequest, ExecuteResponse, GoalResult,
-    PerformRequest, PerformResponse, execute_response,
+    AttachRequest, CancelRequest, CancelResponse, DescribeRequest, DescribeResponse, ExecuteRequest, ExecuteResponse,
+    GoalResult, PerformRequest, PerformResponse, execute_response,
 };
 use ratn_worker::client::{ActionClient, Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
@@ -44,11 +44,16 @@ fn result() -> GoalResult {
 #[tonic::async_trait]
 impl ActionService for Other {
     type ExecuteStream = Answers<ExecuteResponse>;
+    type AttachStream = Answers<ExecuteResponse>;
     type PerformStream = Answers<PerformResponse>;
 
     async fn execute(&self, _: Request<ExecuteRequest>) -> Result<Response<Self::ExecuteStream>, Status> {
         let kind = Some(execute_response::Kind::Result(result()));
         Ok(Response::new(Box::pin(tokio_stream::once(Ok(ExecuteResponse { kind })))))
+    }
+
+    async fn attach(&self, _: Request<AttachRequest>) -> Result<Response<Self::AttachStream>, Status> {
+        Err(Status::unimplemented("Method not implemented!"))
     }
 
     async fn perform(

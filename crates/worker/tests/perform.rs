@@ -63,7 +63,7 @@ impl Line {
 }
 
 fn execute(id: u64, action: &str) -> ExecuteRequest {
-    ExecuteRequest { goal: Some(goal(&format!("goal-{id}"), action, id).into()), known_only: false }
+    ExecuteRequest { goal: Some(goal(&format!("goal-{id}"), action, id).into()) }
 }
 
 #[tokio::test]

@@ -267,7 +267,7 @@ impl Accepted {
         let channel = host.channels.get(&worker.endpoint.parse().unwrap()).unwrap();
         let goal =
             Goal { id: format!("goal-{round}"), action: hop::WAIT.to_owned(), lease: Some(lease), ..Goal::default() };
-        let question = v1::ExecuteRequest { goal: Some(goal.into()), known_only: false };
+        let question = v1::ExecuteRequest { goal: Some(goal.into()) };
         let mut messages = ActionServiceClient::new(channel).execute(question).await.unwrap().into_inner();
         messages.message().await.unwrap().unwrap();
         Accepted { worker: worker.id, messages }

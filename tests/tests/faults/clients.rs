@@ -470,7 +470,7 @@ impl Client {
             ..Default::default()
         };
         let (patience, mut tool) = (self.patience(), self.tool.clone());
-        let question = v1::ExecuteRequest { goal: Some(goal), known_only: false };
+        let question = v1::ExecuteRequest { goal: Some(goal) };
         let performed = async {
             let mut messages = tool.execute(question).await.ok()?.into_inner();
             while let Some(Ok(message)) = messages.next().await {

@@ -6083,10 +6083,13 @@ pub struct ExecuteRequest {
     /// The goal.
     #[prost(message, optional, tag = "1")]
     pub goal: ::core::option::Option<Goal>,
-    /// The goal was given before: join it if it is known, but never begin it. The goal has the lease under which it was given, which may have ended
-    /// since, and the same action and inputs.
-    #[prost(bool, tag = "2")]
-    pub known_only: bool,
+}
+/// A request to join a goal that was given before.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct AttachRequest {
+    /// The goal, with the action and the inputs with which it was given, and the lease under which it was given, which may have ended since.
+    #[prost(message, optional, tag = "1")]
+    pub goal: ::core::option::Option<Goal>,
 }
 /// An event of a goal.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -6452,8 +6455,7 @@ pub mod action_service_client {
         /// FAILED_PRECONDITION: according to the resource manager, the lease does not hold this provider (the provider waits at most one second for news of
         /// a lease that it does not know yet), or the goal was begun before and its result has been forgotten;
         /// UNAVAILABLE: the provider has no contact with the resource manager, or too many goals wait (TOO_MANY_WAITING);
-        /// RESOURCE_EXHAUSTED: the provider is busy, possibly with a cancelled goal that has not stopped (STILL_RUNNING);
-        /// NOT_FOUND: the request says known_only, and the goal is not known.
+        /// RESOURCE_EXHAUSTED: the provider is busy, possibly with a cancelled goal that has not stopped (STILL_RUNNING).
         pub async fn execute(
             &mut self,
             request: impl tonic::IntoRequest<super::ExecuteRequest>,
@@ -6476,6 +6478,33 @@ pub mod action_service_client {
             let mut req = request.into_request();
             req.extensions_mut()
                 .insert(GrpcMethod::new("ratn.v1.ActionService", "Execute"));
+            self.inner.server_streaming(req, path, codec).await
+        }
+        /// Joins a goal that was given before, or gets its result; never begins it. A call of its own, so that a provider that keeps none of its goals
+        /// refuses it (UNIMPLEMENTED), and cannot perform the goal once more. Errors: those of Execute for a goal that is known;
+        /// NOT_FOUND: the goal is not known.
+        pub async fn attach(
+            &mut self,
+            request: impl tonic::IntoRequest<super::AttachRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::ExecuteResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/ratn.v1.ActionService/Attach",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("ratn.v1.ActionService", "Attach"));
             self.inner.server_streaming(req, path, codec).await
         }
         /// Performs any number of executes over one stream, which saves the cost of a stream for each. Each is treated like a call of Execute, but no
@@ -6581,12 +6610,24 @@ pub mod action_service_server {
         /// FAILED_PRECONDITION: according to the resource manager, the lease does not hold this provider (the provider waits at most one second for news of
         /// a lease that it does not know yet), or the goal was begun before and its result has been forgotten;
         /// UNAVAILABLE: the provider has no contact with the resource manager, or too many goals wait (TOO_MANY_WAITING);
-        /// RESOURCE_EXHAUSTED: the provider is busy, possibly with a cancelled goal that has not stopped (STILL_RUNNING);
-        /// NOT_FOUND: the request says known_only, and the goal is not known.
+        /// RESOURCE_EXHAUSTED: the provider is busy, possibly with a cancelled goal that has not stopped (STILL_RUNNING).
         async fn execute(
             &self,
             request: tonic::Request<super::ExecuteRequest>,
         ) -> std::result::Result<tonic::Response<Self::ExecuteStream>, tonic::Status>;
+        /// Server streaming response type for the Attach method.
+        type AttachStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::ExecuteResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Joins a goal that was given before, or gets its result; never begins it. A call of its own, so that a provider that keeps none of its goals
+        /// refuses it (UNIMPLEMENTED), and cannot perform the goal once more. Errors: those of Execute for a goal that is known;
+        /// NOT_FOUND: the goal is not known.
+        async fn attach(
+            &self,
+            request: tonic::Request<super::AttachRequest>,
+        ) -> std::result::Result<tonic::Response<Self::AttachStream>, tonic::Status>;
         /// Server streaming response type for the Perform method.
         type PerformStream: tonic::codegen::tokio_stream::Stream<
                 Item = std::result::Result<super::PerformResponse, tonic::Status>,
@@ -6722,6 +6763,52 @@ pub mod action_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = ExecuteSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/ratn.v1.ActionService/Attach" => {
+                    #[allow(non_camel_case_types)]
+                    struct AttachSvc<T: ActionService>(pub Arc<T>);
+                    impl<
+                        T: ActionService,
+                    > tonic::server::ServerStreamingService<super::AttachRequest>
+                    for AttachSvc<T> {
+                        type Response = super::ExecuteResponse;
+                        type ResponseStream = T::AttachStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::AttachRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ActionService>::attach(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = AttachSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

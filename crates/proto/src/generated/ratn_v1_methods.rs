@@ -39,6 +39,7 @@
     Method { service: "ratn.v1.ProcessService", name: "Drain", operation: Some(Operation::Administer) },
     Method { service: "ratn.v1.ProcessService", name: "ReadLog", operation: Some(Operation::Look) },
     Method { service: "ratn.v1.ActionService", name: "Execute", operation: Some(Operation::Perform) },
+    Method { service: "ratn.v1.ActionService", name: "Attach", operation: Some(Operation::Perform) },
     Method { service: "ratn.v1.ActionService", name: "Perform", operation: Some(Operation::Perform) },
     Method { service: "ratn.v1.ActionService", name: "Cancel", operation: Some(Operation::Perform) },
     Method { service: "ratn.v1.ActionService", name: "Describe", operation: Some(Operation::Look) },

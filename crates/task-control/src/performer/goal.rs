@@ -255,6 +255,11 @@ impl Performing {
             Err(error) if error.code() == Some(tonic::Code::NotFound) => {
                 self.unknown(format!("nobody knows what became of it while task control was gone: {}", said(&error)))
             }
+            // It may be under way: whoever implements no `Attach` keeps none of its goals.
+            Err(error) if error.code() == Some(tonic::Code::Unimplemented) => {
+                let _ = tokio::time::timeout(CANCEL_DEADLINE, self.tell_to_stop(endpoint)).await;
+                self.unknown("its worker does not know which goals it was given before (it has no `Attach`)".to_owned())
+            }
             Err(error) => self.lost(endpoint, &error).await,
         }
     }
@@ -303,11 +308,11 @@ impl Performing {
         Some((lease.id, resource.id.clone()))
     }
 
-    /// The provider's answer cannot be read. If it is not a valid message, it may belong to another goal on the same stream: this goal asks again
-    /// over a separate stream.
+    /// The provider's answer cannot be read. If it is not a valid message, it may belong to another goal on the same stream: this goal is asked
+    /// for over a stream of its own.
     async fn unreadable(&self, endpoint: &Endpoint, unreadable: &CallError) -> Event {
         if !matches!(unreadable, CallError::Malformed { .. }) {
-            let attached = self.actions.attach_alone(endpoint, self.goal.clone(), |said| self.said(said));
+            let attached = self.actions.attach_hearing(endpoint, self.goal.clone(), |said| self.said(said));
             match Box::pin(attached).await {
                 Ok(fate) if !fate.orphaned => return self.finished(fate.outcome),
                 Err(broken @ CallError::Broken { .. }) if !broken.is_unreadable() => {

@@ -31,23 +31,35 @@ impl ActionServer {
 }
 
 impl ActionServer {
-    /// A goal that a caller gives, or asks about again.
+    /// A goal that a caller gives.
     pub(super) async fn given(&self, caller: &Caller, request: v1::ExecuteRequest) -> Result<Messages, Status> {
-        let known_only = request.known_only;
         let inputs = Fingerprint::of(request.goal.as_ref());
         let goal: Goal = required(request.goal, "goal")?;
-        let pending = audit::begin(caller, "", || Mutation::Goal {
-            goal: goal.id.clone(),
-            action: goal.action.clone(),
-            lease: goal.lease.as_ref().map_or(0, |lease| lease.id.0),
-            known_only,
-        });
+        let pending = asked(caller, &goal, false);
         let token = goal.lease.as_ref().map(|lease| lease.token);
-        let admitted =
-            if known_only { self.join(caller, &goal, inputs) } else { self.admit(caller, goal, inputs).await };
+        let admitted = self.admit(caller, goal, inputs).await;
         pending.ended_with(&admitted, |_| token);
         admitted
     }
+
+    /// A goal that a caller asks about again.
+    fn asked_again(&self, caller: &Caller, request: v1::AttachRequest) -> Result<Messages, Status> {
+        let inputs = Fingerprint::of(request.goal.as_ref());
+        let goal: Goal = required(request.goal, "goal")?;
+        let pending = asked(caller, &goal, true);
+        let joined = self.join(caller, &goal, inputs);
+        pending.ended_with(&joined, |_| goal.lease.as_ref().map(|lease| lease.token));
+        joined
+    }
+}
+
+fn asked(caller: &Caller, goal: &Goal, known_only: bool) -> audit::Pending {
+    audit::begin(caller, "", || Mutation::Goal {
+        goal: goal.id.clone(),
+        action: goal.action.clone(),
+        lease: goal.lease.as_ref().map_or(0, |lease| lease.id.0),
+        known_only,
+    })
 }
 
 #[tonic::async_trait]
@@ -57,6 +69,13 @@ impl ActionService for ActionServer {
     async fn execute(&self, request: Request<v1::ExecuteRequest>) -> Result<Response<Self::ExecuteStream>, Status> {
         let caller = Caller::of(&request);
         Ok(Response::new(self.given(&caller, request.into_inner()).await?.into_stream()))
+    }
+
+    type AttachStream = BoxStream<'static, Result<v1::ExecuteResponse, Status>>;
+
+    async fn attach(&self, request: Request<v1::AttachRequest>) -> Result<Response<Self::AttachStream>, Status> {
+        let caller = Caller::of(&request);
+        Ok(Response::new(self.asked_again(&caller, request.into_inner())?.into_stream()))
     }
 
     type PerformStream = Answers<GoalCalls, CallerGoals>;

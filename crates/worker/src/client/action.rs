@@ -116,7 +116,7 @@ impl ActionClient {
         wanted: impl Fn() -> bool,
         mut on_said: impl FnMut(Said),
     ) -> Result<GoalOutcome, CallError> {
-        let question = v1::ExecuteRequest { goal: Some(goal.into()), known_only: false };
+        let question = Question::Execute(v1::ExecuteRequest { goal: Some(goal.into()) });
         let mut tries = 1;
         loop {
             match self.listen(endpoint, question.clone(), &mut on_said).await {
@@ -147,7 +147,8 @@ impl ActionClient {
         Box::pin(self.attach_hearing(endpoint, goal, only_progress(on_progress))).await
     }
 
-    /// As [`ActionClient::attach`], with the intermediate results that a goal gives from now on before its end.
+    /// As [`ActionClient::attach`], with the intermediate results that a goal gives from now on before its end. The call has a stream of its own:
+    /// an answer about another goal cannot break it.
     ///
     /// # Errors
     /// As [`ActionClient::attach`].
@@ -157,37 +158,14 @@ impl ActionClient {
         goal: Goal,
         on_said: impl FnMut(Said),
     ) -> Result<Fate, CallError> {
-        self.listen(endpoint, v1::ExecuteRequest { goal: Some(goal.into()), known_only: true }, on_said).await
-    }
-
-    /// As [`ActionClient::attach_hearing`], over a stream that no other goal shares: an answer about another goal cannot break it.
-    ///
-    /// # Errors
-    /// As [`ActionClient::attach`].
-    pub async fn attach_alone(
-        &self,
-        endpoint: &Endpoint,
-        goal: Goal,
-        on_said: impl FnMut(Said),
-    ) -> Result<Fate, CallError> {
-        self.listen_on(endpoint, v1::ExecuteRequest { goal: Some(goal.into()), known_only: true }, on_said, true).await
+        self.listen(endpoint, Question::Attach(v1::AttachRequest { goal: Some(goal.into()) }), on_said).await
     }
 
     async fn listen(
         &self,
         endpoint: &Endpoint,
-        question: v1::ExecuteRequest,
-        on_said: impl FnMut(Said),
-    ) -> Result<Fate, CallError> {
-        self.listen_on(endpoint, question, on_said, false).await
-    }
-
-    async fn listen_on(
-        &self,
-        endpoint: &Endpoint,
-        question: v1::ExecuteRequest,
+        question: Question,
         mut on_said: impl FnMut(Said),
-        alone: bool,
     ) -> Result<Fate, CallError> {
         let malformed = |m: Malformed| CallError::malformed(endpoint, m);
         let mut nonsense = None;
@@ -205,18 +183,19 @@ impl ActionClient {
                 Err(error) => nonsense = Some(error),
             }
         };
-        let answer = if alone {
-            Box::pin(self.execute_alone(endpoint, question, heard)).await
-        } else {
-            let mut client = self.client(endpoint)?;
-            let open = |questions| async move { client.perform(questions).await };
-            let stream = self.channels.goals(endpoint);
-            match stream.call_with_progress(open, Asked::Execute(question.clone()), &mut heard).await {
-                // The provider implements only the call for a single goal.
-                Err(status) if status.code() == Code::Unimplemented => {
-                    Box::pin(self.execute_alone(endpoint, question, heard)).await
+        let answer = match question {
+            Question::Attach(_) => Box::pin(self.alone(endpoint, question, heard)).await,
+            Question::Execute(ref execute) => {
+                let mut client = self.client(endpoint)?;
+                let open = |questions| async move { client.perform(questions).await };
+                let stream = self.channels.goals(endpoint);
+                match stream.call_with_progress(open, Asked::Execute(execute.clone()), &mut heard).await {
+                    // The provider implements only the call for a single goal.
+                    Err(status) if status.code() == Code::Unimplemented => {
+                        Box::pin(self.alone(endpoint, question, heard)).await
+                    }
+                    answer => answer,
                 }
-                answer => answer,
             }
         };
         let answer = answer.map_err(|status| CallError::from_status(endpoint, &status))?;
@@ -230,15 +209,19 @@ impl ActionClient {
         Ok(Fate { outcome: result.try_into().map_err(malformed)?, orphaned })
     }
 
-    /// Executes a goal over a stream of its own.
-    async fn execute_alone(
+    /// Asks over a stream that no other goal shares.
+    async fn alone(
         &self,
         endpoint: &Endpoint,
-        question: v1::ExecuteRequest,
+        question: Question,
         mut heard: impl FnMut(Heard),
     ) -> Result<Heard, Status> {
         let mut client = self.client(endpoint).map_err(|error| Status::unavailable(chain(&error)))?;
-        let mut answers = client.execute(question).await?.into_inner();
+        let answers = match question {
+            Question::Execute(question) => client.execute(question).await,
+            Question::Attach(question) => client.attach(question).await,
+        };
+        let mut answers = answers?.into_inner();
         while let Some(answer) = answers.message().await? {
             match answer.kind {
                 Some(Kind::Progress(progress)) => heard(Heard::Progress(progress)),
@@ -297,6 +280,15 @@ impl ActionClient {
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES))
     }
+}
+
+/// What is asked about a goal.
+#[derive(Clone)]
+enum Question {
+    /// Performs it.
+    Execute(v1::ExecuteRequest),
+    /// Joins it where it is known.
+    Attach(v1::AttachRequest),
 }
 
 /// A listener for progress reports alone.

@@ -3,8 +3,8 @@ use futures::Stream;
 use ratn_proto::v1;
 use ratn_proto::v1::action_service_server::{ActionService, ActionServiceServer};
 use ratn_proto::v1::{
-    CancelRequest, CancelResponse, DescribeRequest, DescribeResponse, ExecuteRequest, ExecuteResponse, GoalResult,
-    PerformRequest, PerformResponse, execute_response,
+    AttachRequest, CancelRequest, CancelResponse, DescribeRequest, DescribeResponse, ExecuteRequest, ExecuteResponse,
+    GoalResult, PerformRequest, PerformResponse, execute_response,
 };
 use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
 use ratn_worker::server::{Services, bind};
@@ -214,6 +214,7 @@ type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 #[tonic::async_trait]
 impl ActionService for Late {
     type ExecuteStream = Answers<ExecuteResponse>;
+    type AttachStream = Answers<ExecuteResponse>;
     type PerformStream = Answers<PerformResponse>;
 
     async fn execute(&self, _: Request<ExecuteRequest>) -> Result<Response<Self::ExecuteStream>, Status> {
@@ -225,6 +226,10 @@ impl ActionService for Late {
         self.begun.fetch_add(1, Ordering::SeqCst);
         self.stop.cancelled().await;
         Err(Status::aborted("stopped"))
+    }
+
+    async fn attach(&self, _: Request<AttachRequest>) -> Result<Response<Self::AttachStream>, Status> {
+        Err(Status::unimplemented(""))
     }
 
     async fn perform(&self, _: Request<Streaming<PerformRequest>>) -> Result<Response<Self::PerformStream>, Status> {
@@ -282,11 +287,16 @@ struct Elsewhere(Result<GoalResult, Status>);
 #[tonic::async_trait]
 impl ActionService for Elsewhere {
     type ExecuteStream = Answers<ExecuteResponse>;
+    type AttachStream = Answers<ExecuteResponse>;
     type PerformStream = Answers<PerformResponse>;
 
     async fn execute(&self, _: Request<ExecuteRequest>) -> Result<Response<Self::ExecuteStream>, Status> {
         let answer = ExecuteResponse { kind: Some(execute_response::Kind::Result(self.0.clone()?)) };
         Ok(Response::new(Box::pin(futures::stream::iter([Ok(answer)]))))
+    }
+
+    async fn attach(&self, _: Request<AttachRequest>) -> Result<Response<Self::AttachStream>, Status> {
+        Err(Status::unimplemented(""))
     }
 
     async fn perform(&self, _: Request<Streaming<PerformRequest>>) -> Result<Response<Self::PerformStream>, Status> {
@@ -392,5 +402,26 @@ async fn of_the_results_before_the_end_those_are_taken_that_are_better_and_so_ma
     performing.perform(Given::Now).await;
     let event = bench.event().await;
     assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == ABORTED), "{event:?}");
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_goal_of_before_is_not_begun_again_by_a_worker_that_keeps_none_of_its_goals() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let begun = Arc::new(Late { refuses: 0.into(), begun: 0.into(), stop: CancellationToken::new() });
+    let bound = bind(&Endpoint::Unix(bench._place.path().join("plain.sock"))).await?;
+    let mut performing = bench.performing("work", None, 0);
+    performing.endpoint = Ok(bound.endpoint().clone());
+    let services = Services::new().with(ActionServiceServer::from_arc(begun.clone()));
+    tokio::spawn(bound.serve(services, CancellationToken::new()));
+    // It was given before, and is under way or has ended: the worker tells neither.
+    begun.begun.store(1, Ordering::SeqCst);
+    performing.perform(Given::Before).await;
+    let event = bench.event().await;
+    assert!(
+        matches!(&event, Some(Event::Crashed { reason, unknown: true, .. }) if reason.contains("Attach")),
+        "{event:?}"
+    );
+    assert!(begun.begun.load(Ordering::SeqCst) == 1 && begun.stop.is_cancelled(), "it is told to stop");
     Ok(())
 }
