@@ -25,6 +25,8 @@ fn check_refuses_every_bad_task_for_its_rule() -> anyhow::Result<()> {
         ensure!(out.is_empty(), "{file}: {out}");
         let place_and_rule = err.lines().any(|line| line.starts_with(file) && line.contains(&format!("error[{rule}]")));
         ensure!(place_and_rule, "{file}: {err}");
+        let help = text.lines().nth(1).and_then(|line| line.strip_prefix("# help: ")).unwrap_or_default();
+        ensure!(err.contains(help), "{file}: {err}");
         seen += 1;
     }
     ensure!(seen >= 25, "only {seen} bad tasks");

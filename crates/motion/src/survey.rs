@@ -58,6 +58,7 @@ pub fn survey(robot: &Robot) -> Survey {
         survey.add_arm(other, &whose);
         survey.add_postures(other, &scene, &whose);
     }
+    survey.add_exceptions(robot);
     let Survey { mut lines, mut faults } = survey;
     match robot.workplace() {
         None => lines.push("workplace none: the simulated cell does not take it".to_owned()),
@@ -105,6 +106,12 @@ impl Survey {
             Some(_) => format!("opens to {:.0} mm", 2e3 * robot.open_finger_m()),
             None => "none: it grasps nothing".to_owned(),
         };
+        if robot.finger().is_some() && 2.0 * robot.open_finger_m() > away {
+            self.faults.push(format!(
+                "the gripper{whose} opens to {:.2} m, further than the arm reaches ({away:.2} m): the limits of a sliding joint are in metres",
+                2.0 * robot.open_finger_m()
+            ));
+        }
         let arm = if whose.is_empty() { String::new() } else { format!("`{}`, ", robot.arm_name()) };
         self.lines.extend([
             format!("arm       {arm}{} joints to the link `{tool}`: {}", joints.len(), joints.join(", ")),
@@ -137,6 +144,29 @@ impl Survey {
             let names = [&arm.links[a].name[..], &arm.links[b].name];
             let [a, b] = names;
             self.faults.push(format!("{a} meets {b} in every posture of the arm, {}", no_joint_parts(names)));
+        }
+    }
+
+    /// Adds the lines that an SRDF lacks, or begins with where there is none and something is amiss: one with any exception takes the place of what is
+    /// left out by itself.
+    fn add_exceptions(&mut self, robot: &Robot) {
+        let model = &robot.model;
+        let excepted = &model.checks().excepted;
+        let (said, pairs): (_, Vec<Pair>) = if model.has_exceptions() {
+            let lacking = pairs::checks(model).excepted.difference(excepted).copied().collect();
+            ("the SRDF leaves these out, which are made to touch, so they are checked", lacking)
+        } else if !self.faults.is_empty() {
+            (
+                "an SRDF with any exception takes the place of what is left out by itself: begin it with",
+                excepted.iter().copied().collect(),
+            )
+        } else {
+            return;
+        };
+        if !pairs.is_empty() {
+            self.lines.push(format!("srdf      {said}"));
+            let line = |pair: &Pair| format!("          {}", pairs::exception(model, *pair, "Adjacent"));
+            self.lines.extend(pairs.iter().map(line));
         }
     }
 

@@ -65,6 +65,36 @@ fn links_that_leave_the_search_no_room_are_named_with_what_to_do_and_so_does_the
 }
 
 #[test]
+fn the_first_lines_of_an_srdf_are_written_out_and_neighbours_that_one_leaves_out_are_named() {
+    // Two neighbours that are made to touch, and a block on the last one that meets the foot in every posture.
+    let block = |name: &str, z: f64| {
+        format!(
+            "<link name='{name}'><collision><origin xyz='0 0 {z}'/><geometry><box size='0.1 0.1 0.1'/></geometry></collision></link>"
+        )
+    };
+    let joint = |name: &str, parent: &str, child: &str| {
+        format!(
+            "<joint name='{name}' type='revolute'><parent link='{parent}'/><child link='{child}'/><origin xyz='0 0 0.1'/>\
+             <axis xyz='0 0 1'/><limit lower='-1' upper='1' velocity='1' effort='1'/></joint>"
+        )
+    };
+    let links = block("foot", 0.0) + &block("middle", 0.0) + &block("top", -0.2);
+    let joints = joint("lower", "foot", "middle") + &joint("upper", "middle", "top");
+    let urdf = format!("<robot name='r'>{links}{joints}</robot>");
+    let robot = |srdf: &str| with_postures(&urdf, srdf, &["lower", "upper"], "top");
+    let except =
+        |[a, b]: [&str; 2], why: &str| format!("<disable_collisions link1=\"{a}\" link2=\"{b}\" reason=\"{why}\"/>");
+    let neighbours = [except(["foot", "middle"], "Adjacent"), except(["middle", "top"], "Adjacent")];
+    let has = |survey: &Survey, line: &str| survey.lines.iter().any(|one| one.trim() == line);
+    let one = survey(&robot(&format!("<robot name='r'>{}</robot>", except(["foot", "top"], "Default"))));
+    // The other two meet in every posture, which is seen without an SRDF, too.
+    assert!(has(&one, &neighbours[1]) && !has(&one, &neighbours[0]), "{:?}", one.lines);
+    let all = except(["foot", "top"], "Default") + &neighbours.concat();
+    let all = survey(&robot(&format!("<robot name='r'>{all}</robot>")));
+    assert!(all.faults.is_empty() && neighbours.iter().all(|line| !has(&all, line)), "{all:?}");
+}
+
+#[test]
 fn how_near_links_with_meshes_are_is_said_by_their_meshes() {
     let link = |name: &str| {
         format!("<link name='{name}'><collision><geometry><mesh filename='cube.stl'/></geometry></collision></link>")

@@ -237,13 +237,8 @@ pub(super) fn refused(findings: &[Diagnostic]) -> Failure {
     Failure::Refused(lines.join("\n"))
 }
 
-/// The program of a task file, beginning at the state `from` where one is given; warnings go to standard error.
-pub(crate) fn load(path: &Path, from: Option<&str>, catalogue: &Catalogue) -> Result<Program, Failure> {
-    let (text, file) = (read(path)?, path.display().to_string());
-    accepted(ratn_model::load::load_beginning(&text, &file, catalogue, &input::Libraries, from))
-}
-
-/// As [`load`], returning the findings where the task is refused.
+/// The program of a task file, beginning at the state `from` where one is given, or the findings where the task is refused; warnings go to standard
+/// error.
 pub(super) fn found(
     path: &Path,
     from: Option<&str>,

@@ -69,6 +69,12 @@ struct Line {
 
 /// Solves all problems and prints a line per class.
 pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
+    if arguments.robot.extension().is_some_and(|extension| extension == "toml") {
+        let file = arguments.robot.display();
+        return Err(Failure::Refused(format!(
+            "ratn: {file}: `ratn plan` takes the URDF that a robot.toml names (`urdf`), and its `srdf` with --srdf"
+        )));
+    }
     let urdf = read(&arguments.robot)?;
     let srdf = arguments.srdf.as_deref().map(read).transpose()?;
     let beside = arguments.problems.parent().unwrap_or(Path::new("")).to_owned();

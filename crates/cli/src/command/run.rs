@@ -61,6 +61,19 @@ pub(crate) fn run(arguments: &RunArguments, tls: &ClientTls) -> Result<(), Failu
     })
 }
 
+/// Starts a system for one run.
+async fn start(
+    config: &SystemConfig,
+    tls: &ClientTls,
+    directory: &Path,
+    interrupt: &Interrupt,
+) -> Result<System, Failure> {
+    output::progress(format_args!("no system runs in {}: starting one for this run", directory.display()));
+    let system = starting(Box::pin(System::start_private(config.clone(), tls)), interrupt).await?;
+    output::progress(format_args!("its runtime directory: {}", system.directory().path().display()));
+    Ok(system)
+}
+
 async fn begin(
     arguments: &RunArguments,
     task: &Path,
@@ -89,9 +102,28 @@ async fn begin(
         system.mismatches.iter().for_each(|what| output::progress(format_args!("warning: {what}")));
     }
     let from = arguments.from.as_deref();
+    let mut started = None;
     let program = match &mut found {
         Some(system) => Box::pin(described::program(task, from, system, interrupt)).await?,
-        None => check::load(task, from, &config.catalogue)?,
+        None => match check::found(task, from, &config.catalogue)? {
+            Ok(program) => program,
+            // A worker of this config may say it of itself once it runs.
+            Err(findings) if described::is_lacking(&findings) && config.starts_other_programs() => {
+                let mut system = start(&config, tls, directory, interrupt).await?;
+                let program = Box::pin(described::program(task, from, &mut system, interrupt)).await;
+                match program {
+                    Ok(program) => {
+                        started = Some(system);
+                        program
+                    }
+                    Err(refused) => {
+                        system.stop().await;
+                        return Err(refused);
+                    }
+                }
+            }
+            Err(findings) => return Err(check::refused(&findings)),
+        },
     };
     let parameters = program
         .bind_parameters(&arguments.set)
@@ -130,12 +162,10 @@ async fn begin(
             }
             system
         }
-        None => {
-            output::progress(format_args!("no system runs in {}: starting one for this run", directory.display()));
-            let system = starting(Box::pin(System::start_private(config.clone(), tls)), interrupt).await?;
-            output::progress(format_args!("its runtime directory: {}", system.directory().path().display()));
-            system
-        }
+        None => match started {
+            Some(system) => system,
+            None => start(&config, tls, directory, interrupt).await?,
+        },
     };
     system.offered.lacking(&program).iter().for_each(|what| output::progress(format_args!("warning: {what}")));
     let way = way(arguments);

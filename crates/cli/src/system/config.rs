@@ -86,6 +86,8 @@ struct Parts {
     chain: Option<JointChain>,
     /// The attributes of the modules of each kind, in order: the cell's host, and for a robot with several arms the arm.
     attributes: ModuleAttributes,
+    /// Whether it has a workplace: then the simulated cell has its modules, else drivers offer them.
+    workplace: bool,
     /// Whether its workplace has a middle, which several arms reach.
     middle: bool,
 }
@@ -111,6 +113,7 @@ impl Default for Parts {
             joints: ArmJoints::AsSaid,
             chain: None,
             attributes: ModuleAttributes::new(),
+            workplace: true,
             middle: false,
         }
     }
@@ -291,8 +294,9 @@ impl SystemConfig {
                 let said = said.map(|(name, value)| (name.to_owned(), Value::String(value.to_owned())));
                 attributes.entry(module.kind().to_owned()).or_default().push(said.collect());
             }
+            let workplace = robot.workplace().is_some();
             let middle = robot.workplace().is_some_and(|workplace| workplace.middle.is_some());
-            self.parts = Parts { modules, joints, chain, attributes, middle };
+            self.parts = Parts { modules, joints, chain, attributes, workplace, middle };
         }
         self.catalogue.check().context("`catalogue`")?;
         self.parts.fit(&mut self.catalogue, &self.process_manager.templates);
@@ -301,9 +305,8 @@ impl SystemConfig {
 
     /// Checks that a bundled worker gets the system's robot. `{robot}` is substituted.
     fn check_told(&self, template: &Template) -> anyhow::Result<()> {
-        let Template { name, program, python, args, .. } = template;
-        let is_ratn = program.as_ref().is_none_or(|program| Path::new(program).file_name() == Some("ratn".as_ref()));
-        if python.is_some() || !is_ratn || !args.iter().any(|argument| argument == "worker") {
+        let Template { name, args, .. } = template;
+        if is_other_program(template) || !args.iter().any(|argument| argument == "worker") {
             return Ok(());
         }
         let said = "\"--robot\", \"{robot}\"";
@@ -382,11 +385,17 @@ impl SystemConfig {
         config
     }
 
+    /// Whether a system on one machine has the simulated cell: a robot without a workplace has drivers in its place.
+    pub(crate) fn has_cell(&self) -> bool {
+        self.parts.workplace
+    }
+
     /// The amount of each kind that exists once the system is ready.
     pub(crate) fn promised_resources(&self) -> BTreeMap<String, Quantity> {
         let mut promised: BTreeMap<String, Quantity> = BTreeMap::new();
         let middle = self.parts.middle.then_some(MIDDLE);
-        for kind in self.parts.modules.iter().map(|module| module.kind()).chain([BATTERY]).chain(middle) {
+        let of_the_cell = self.parts.modules.iter().map(|module| module.kind()).chain([BATTERY]).chain(middle);
+        for kind in of_the_cell.filter(|_| self.has_cell()) {
             *promised.entry(kind.to_owned()).or_default() += Quantity::ONE;
         }
         promised.insert(self.world_pool.kind.clone(), self.world_pool.capacity.into());
@@ -394,6 +403,25 @@ impl SystemConfig {
             *promised.entry(template.kind.clone()).or_default() += template.min.into();
         }
         promised
+    }
+
+    /// Whether templates start workers that are another program than `ratn`, and so may describe actions that the catalogue does not have.
+    pub(crate) fn starts_other_programs(&self) -> bool {
+        self.process_manager.templates.iter().any(is_other_program)
+    }
+
+    /// The kinds of resources that perform actions of the catalogue and that neither the cell nor a template offers, each with its providers.
+    pub(crate) fn offered_by_nobody(&self) -> BTreeMap<&str, Vec<&str>> {
+        let kinds = self.resource_manager.hierarchy();
+        let promised = self.promised_resources();
+        let templates = self.process_manager.templates.iter().map(|template| template.kind.as_str());
+        let offered: BTreeSet<&str> = promised.keys().map(String::as_str).chain(templates).collect();
+        let is_offered = |kind: &str| offered.iter().any(|one| kinds.is_a(one, kind));
+        let mut nobody: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+        for (name, provider) in self.catalogue.providers.iter().filter(|(_, one)| !is_offered(&one.resource)) {
+            nobody.entry(&provider.resource).or_default().push(name);
+        }
+        nobody
     }
 
     /// Whether resources of a kind are the robot's arms or grippers, and not a worker's.
@@ -412,6 +440,12 @@ impl SystemConfig {
     pub(crate) fn to_toml(&self) -> anyhow::Result<String> {
         toml::to_string(self).context("cannot write the config")
     }
+}
+
+/// Whether the workers of a template are another program than `ratn`.
+fn is_other_program(template: &Template) -> bool {
+    let is_ratn = |program: &Path| program.file_name() == Some("ratn".as_ref());
+    template.python.is_some() || !template.program.as_deref().is_none_or(is_ratn)
 }
 
 /// The robot in a worker's arguments, as `--robot=NAME` or `--robot NAME`.
@@ -497,6 +531,32 @@ mod tests {
         assert_eq!(parse(&config.to_toml().unwrap(), "again").unwrap(), config);
         let six = parse("robot = \"ur5\"", "x.toml").unwrap();
         assert_eq!(six.catalogue.providers["arm"].joints, Some(6));
+    }
+
+    #[test]
+    fn a_robot_without_a_workplace_has_no_cell_and_what_drivers_are_to_offer_is_named() {
+        let place = tempfile::tempdir().unwrap();
+        let at = |name: &str| place.path().join(name);
+        let link = "<link name='foot'/><link name='tip'/>";
+        let joint = "<joint name='turn' type='revolute'><parent link='foot'/><child link='tip'/><axis xyz='0 0 1'/>\
+                     <limit lower='-1' upper='1' velocity='1' effort='1'/></joint>";
+        std::fs::write(at("r.urdf"), format!("<robot name='r'>{link}{joint}</robot>")).unwrap();
+        let toml = "name = 'bare'\nurdf = 'r.urdf'\n[arm]\njoints = ['turn']\ntool = 'tip'\n[postures]\nhome = [0]\n";
+        std::fs::write(at("robot.toml"), toml).unwrap();
+        let robot = format!("robot = {:?}\n", at("robot.toml"));
+        let template = |kind: &str| {
+            format!("[[process-manager.template]]\nname = \"w\"\nkind = \"{kind}\"\nprogram = \"/bin/true\"\n")
+        };
+        let of = |more: &str| parse(&format!("{robot}{more}"), "x.toml").unwrap();
+        let bare = of("");
+        assert!(!bare.has_cell() && !bare.promised_resources().contains_key("Arm"));
+        assert_eq!(bare.offered_by_nobody()["Arm"], ["arm"]);
+        assert!(!bare.offered_by_nobody().contains_key(PATH_PLANNER));
+        assert!(!of(&template("Arm")).offered_by_nobody().contains_key("Arm"));
+        let below = "[resource-manager.kinds]\nShortArm = [\"Arm\"]\n";
+        assert!(!of(&(template("ShortArm") + below)).offered_by_nobody().contains_key("Arm"));
+        let own = SystemConfig::load(None).unwrap();
+        assert!(own.has_cell() && own.offered_by_nobody().is_empty(), "{:?}", own.offered_by_nobody());
     }
 
     #[test]

@@ -58,8 +58,12 @@ pub(crate) struct Judgement {
     pub(crate) unintended_contacts: Vec<UnintendedContact>,
 }
 
-/// The roles of a system on one machine, in the order of starting.
+/// The roles of a system on one machine, in the order of starting; the cell only where the robot has a workplace in it.
 const ROLES: [&str; 4] = ["resource-manager", "world-pool", CELL, PROCESS_MANAGER];
+
+fn roles(config: &SystemConfig) -> Vec<&'static str> {
+    ROLES.into_iter().filter(|role| *role != CELL || config.has_cell()).collect()
+}
 
 /// A running system.
 #[derive(Debug)]
@@ -116,7 +120,13 @@ impl System {
         }
         let file = directory.path().join(CONFIG_FILE);
         std::fs::write(&file, config.to_toml()?).with_context(|| format!("cannot write {}", file.display()))?;
-        let mut processes = Processes::start(&ROLES, &file, directory.path())?;
+        if !config.has_cell() {
+            output::progress(format_args!(
+                "the robot `{}` has no [workplace], so there is no simulated cell: drivers offer its arm and what else it has (docs/workers.md)",
+                config.robot
+            ));
+        }
+        let mut processes = Processes::start(&roles(&config), &file, directory.path())?;
         let keeps = private.is_none().then(|| directory.path());
         match ready(&mut processes, &directory, &config, tls, keeps).await {
             Ok(endpoints) => {
@@ -315,8 +325,8 @@ async fn ready(
     let channels = Channels::new(tls);
     let (mut crashes, mut asked) = (Crashes::default(), None::<Instant>);
     let missing = async || {
-        let roles = ROLES.iter().filter(|role| directory.find(role).is_err());
-        let roles: Vec<String> = roles.map(|&role| role.to_owned()).collect();
+        let roles = roles(config).into_iter().filter(|role| directory.find(role).is_err());
+        let roles: Vec<String> = roles.map(str::to_owned).collect();
         if !roles.is_empty() {
             return Ok(roles);
         }

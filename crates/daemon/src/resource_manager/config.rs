@@ -50,7 +50,7 @@ impl Default for ResourceManagerConfig {
 
 impl ResourceManagerConfig {
     /// The hierarchy of kinds; empty if they violate [`Check::check`].
-    pub(crate) fn hierarchy(&self) -> Kinds {
+    pub fn hierarchy(&self) -> Kinds {
         Kinds::new(&self.kinds).unwrap_or_default()
     }
 

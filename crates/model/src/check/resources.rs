@@ -201,7 +201,8 @@ fn only_looks(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
             let at = i.map_or(state.location, |i| at(&format!("resources.{i}")));
             let message = format!("a state that {claim} cannot block `{kind}`, which moves the robot");
             // A state around it blocks the resource all the time.
-            let around = "a state around it blocks that for all its states: do this before that one begins, and give what it makes in";
+            let around = "a state around it blocks that for all its states: do this before that one begins, and give what it makes in; or, where that \
+                          has to be held meanwhile (a camera on the arm), make it a PIA (`pia: true`)";
             let help = if i.is_none() { around } else { help };
             findings.error("computes-actuates", at, &state.path, message, help);
         }

@@ -155,10 +155,12 @@ fn parse<T>(
             // `if a then b else c` stops behind the word `if`.
             let behind = parser.next.checked_sub(1).and_then(|before| parser.tokens.get(before));
             let help = behind.map_or_else(String::new, |(_, before)| meant(before));
-            Err(error.with_help(if matches!(behind, Some((_, Token::Word(_)))) && !help.is_empty() {
-                help
-            } else {
-                meant(other)
+            Err(error.with_help(match (behind, other) {
+                (Some((_, Token::Word(_))), _) if !help.is_empty() => help,
+                (Some((_, Token::Int(_) | Token::Float(_))), Token::Word(_)) if meant(other).is_empty() => {
+                    "write the number alone: units are seconds, metres and radians".to_owned()
+                }
+                _ => meant(other),
             }))
         }
     }

@@ -11,6 +11,7 @@ use crate::program::{
     ABORTED, Annotations, Exceptions, Location, Nature, PREEMPTED, Program, Retry, SUCCESS, State, StateKind, Target,
     VIOLATED,
 };
+use crate::wait::Wait;
 use std::collections::BTreeMap;
 
 /// Limit of the outcomes of one state.
@@ -117,7 +118,13 @@ pub(crate) fn outcomes_exist(task: &Task<'_>, program: &Program, out: &mut Outpu
         let tried = retried.into_iter().flat_map(|retried| &retried.on).map(|outcome| (outcome, "retry.on".to_owned()));
         for (outcome, part) in connected.chain(marked).chain(tried).filter(|(outcome, _)| !own.contains(outcome)) {
             let at = out.places.of(state.id, &part, state.location);
-            let help = suggestion(outcome, own.iter().map(String::as_str), "", "declare it under `outcomes`");
+            // A choice becomes an outcome of its question where it is connected.
+            let choices = match state.wait() {
+                Some(Wait::Answer(question)) => question.choices,
+                _ => Vec::new(),
+            };
+            let known = own.iter().map(String::as_str).chain(choices);
+            let help = suggestion(outcome, known, "", "declare it under `outcomes`");
             out.findings.error(
                 "unknown-outcome",
                 at,

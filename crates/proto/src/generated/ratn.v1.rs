@@ -646,14 +646,14 @@ pub struct RecallRequest {
     /// A session of the caller: the requests were made for it or for another session of the same opener.
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
-    /// The requests, at most 1,000.
+    /// The requests, at most 1,000, none of them twice.
     #[prost(string, repeated, tag = "2")]
     pub request_ids: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
 /// The results of earlier requests.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct RecallResponse {
-    /// In the order of the requested ids.
+    /// In the order of the requested ids, at least one. An answer that grows long has only the first of them: ask for the others again.
     #[prost(message, repeated, tag = "1")]
     pub requests: ::prost::alloc::vec::Vec<RecalledRequest>,
 }

@@ -174,13 +174,15 @@ impl ResourceClient {
     /// [`CallError`].
     pub async fn recall(&self, requests: &[String]) -> Result<Vec<Option<Recalled>>, CallError> {
         let mut recalled = Vec::with_capacity(requests.len());
-        for some in requests.chunks(RECALLED_AT_ONCE) {
+        // A long answer is only about the first requests.
+        while let Some(rest) = requests.get(recalled.len()..).filter(|rest| !rest.is_empty()) {
+            let some = &rest[..rest.len().min(RECALLED_AT_ONCE)];
             let question = v1::RecallRequest { session_id: self.session.clone(), request_ids: some.to_vec() };
             let answer = self.client.clone().recall(question).await.map_err(|status| self.failed(&status))?;
             let answer: Vec<Option<Recalled>> =
                 each(answer.into_inner().requests, "requests").map_err(|m| self.malformed(m))?;
-            if answer.len() != some.len() {
-                return Err(self.malformed(Malformed::new("requests", "are not as many as were asked for")));
+            if answer.is_empty() || answer.len() > some.len() {
+                return Err(self.malformed(Malformed::new("requests", "are none, or more than were asked for")));
             }
             recalled.extend(answer);
         }

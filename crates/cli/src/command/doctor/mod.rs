@@ -99,7 +99,7 @@ pub(super) fn run(arguments: &DoctorArguments, client_tls: &ClientTls) -> Result
     let client_tls = &config.service.client_tls(client_tls).unwrap_or_else(|_| client_tls.clone());
     machine::check(&mut findings, &config, &directory);
     tls::check(&mut findings, &config);
-    templates::check(&mut findings, &config.process_manager);
+    templates::check(&mut findings, &config);
     if let Some(why) = denied(&directory) {
         findings.problem("system", why, "look at one of your own: --runtime-dir DIR, or $RATN_RUNTIME_DIR");
         return conclude(arguments, findings);

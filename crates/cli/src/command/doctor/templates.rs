@@ -1,10 +1,17 @@
-//! Templates: whether their programs exist and may be started.
+//! Templates: whether their programs exist and may be started, and whether somebody offers what the actions of the catalogue need.
 
 use super::Findings;
-use ratn_daemon::process_manager::ProcessManagerConfig;
+use crate::system::config::SystemConfig;
 
-pub(super) fn check(findings: &mut Findings, config: &ProcessManagerConfig) {
-    for template in &config.templates {
+pub(super) fn check(findings: &mut Findings, config: &SystemConfig) {
+    for (kind, providers) in config.offered_by_nobody() {
+        findings.warning(
+            format!("kind {kind}"),
+            format!("nothing here offers a {kind}, which performs `{}`", providers.join("`, `")),
+            "a run that needs one waits for it: add a template with this kind, or see that another host has one",
+        );
+    }
+    for template in &config.process_manager.templates {
         let about = format!("template {}", template.name);
         match template.obstacle() {
             Some(obstacle) => findings.problem(

@@ -20,6 +20,11 @@ const POLL: Duration = Duration::from_millis(250);
 /// Rules of findings about an action without a description.
 const NOT_DESCRIBED: [&str; 2] = ["unknown-provider", "unknown-action"];
 
+/// Whether the catalogue lacks an action that a worker may still describe.
+pub(super) fn is_lacking(findings: &[Diagnostic]) -> bool {
+    findings.iter().any(|finding| NOT_DESCRIBED.contains(&finding.rule.as_str()))
+}
+
 /// Loads the task. Where it uses an action that the catalogue does not have, and workers of the system are away, waits for their descriptions.
 pub(super) async fn program(
     task: &Path,
@@ -34,7 +39,7 @@ pub(super) async fn program(
             Ok(program) => return Ok(program),
             Err(findings) => findings,
         };
-        let lacks = findings.iter().any(|finding| NOT_DESCRIBED.contains(&finding.rule.as_str()));
+        let lacks = is_lacking(&findings);
         let awaited = system.offered.awaited();
         if !lacks {
             return Err(check::refused(&findings));

@@ -32,6 +32,9 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
+/// An answer about earlier requests ends behind the request with which it has so many units.
+const RECALLED_UNITS: usize = 4_096;
+
 /// A session lives at least this long.
 const MIN_SESSION_TTL: Duration = Duration::from_millis(50);
 
@@ -220,8 +223,7 @@ impl Core for ResourceCore {
                 }
             }
             Message::Recall { speaker, session, request_ids, answer } => {
-                let recalled = request_ids.iter().map(|id| self.pool.recall(now, &speaker, &session, id));
-                let recalled: Result<Vec<_>, _> = recalled.collect();
+                let recalled = recalled(&request_ids, |id| self.pool.recall(now, &speaker, &session, id));
                 context.reply(answer, recalled.map_err(|error| status::of_error(&error)));
             }
             Message::Search { mut search, resources, answer } => {
@@ -395,4 +397,48 @@ fn refuse_change(message: Message, stopped: Status, context: &mut ResourceTurn) 
         | Message::Watch { .. }) => return Some(read),
     }
     None
+}
+
+/// What is known of earlier requests, in their order, until the answer is long; at least of the first.
+fn recalled(
+    request_ids: &[String],
+    mut recall: impl FnMut(&str) -> Result<Option<Reply>, PoolError>,
+) -> Result<Vec<Option<Reply>>, PoolError> {
+    let (mut all, mut units) = (Vec::new(), 0);
+    for id in request_ids {
+        let reply = recall(id)?;
+        if let Some(Reply::Operated(operated)) = &reply {
+            units += operated.len();
+        }
+        all.push(reply);
+        if units >= RECALLED_UNITS {
+            break;
+        }
+    }
+    Ok(all)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_model::resource::{OperatedUnits, Quantity};
+
+    #[test]
+    fn an_answer_about_earlier_requests_ends_when_it_is_long_and_has_the_first_in_any_case() {
+        let ids: Vec<String> = (0..100).map(|id| format!("r{id}")).collect();
+        let asked = |each: usize| {
+            let mut asked = 0;
+            let reply = |_: &str| {
+                asked += 1;
+                let (resource, kind) = ("r".to_owned(), "K".to_owned());
+                let unit = OperatedUnits { resource, kind, units: Quantity::ONE, ends_with_session: false };
+                Ok(Some(Reply::Operated(vec![unit; each])))
+            };
+            let answered = recalled(&ids, reply).map(|all| all.len());
+            (answered, asked)
+        };
+        assert_eq!(asked(1), (Ok(100), 100));
+        assert_eq!(asked(RECALLED_UNITS / 4), (Ok(4), 4));
+        assert_eq!(asked(10 * RECALLED_UNITS), (Ok(1), 1));
+    }
 }

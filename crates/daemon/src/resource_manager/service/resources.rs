@@ -11,6 +11,7 @@ use ratn_proto::convert::{all, kind, name, required};
 use ratn_proto::types::{ENDPOINT_ATTRIBUTE, Recalled, Resource, ResourceFilter};
 use ratn_proto::v1;
 use ratn_resources::{Reply, Request, ResourceSpec, Search};
+use std::collections::BTreeSet;
 use tonic::{Code, Status};
 
 /// Maximum number of resources examined in one turn for a list.
@@ -95,6 +96,10 @@ pub(super) async fn recall(
     if request.request_ids.len() > MOST_IDS {
         let message = format!("request_ids: there are more than {MOST_IDS}");
         return Err(status(Code::InvalidArgument, "MALFORMED", message));
+    }
+    let mut seen = BTreeSet::new();
+    if let Some(twice) = request.request_ids.iter().find(|id| !seen.insert(*id)) {
+        return Err(status(Code::InvalidArgument, "MALFORMED", format!("request_ids: {twice} is there twice")));
     }
     let (speaker, request_ids) = (speaker(caller), request.request_ids);
     let recall = |answer| Message::Recall { speaker, session, request_ids, answer };
