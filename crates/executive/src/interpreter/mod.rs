@@ -197,12 +197,12 @@ struct Current {
     units: Vec<String>,
 }
 
-/// The interpreter of one state.
+/// The interpreter of one state. A region's thread has the number of the region's place in the program ([`crate::plan::StatePlan::place`]): no two
+/// threads execute one region at once, and threads go on in the order in which their regions are written.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Interpreter {
     #[serde(with = "checkpoint")]
     threads: BTreeMap<u64, Thread>,
-    last_thread: u64,
     outputs: BTreeMap<StateId, Outputs>,
     /// States of loop bodies whose outputs are still those of the iteration before.
     earlier: BTreeSet<StateId>,
@@ -259,7 +259,6 @@ impl Interpreter {
         };
         Interpreter {
             threads: BTreeMap::from([(MAIN, main)]),
-            last_thread: MAIN,
             outputs,
             earlier: BTreeSet::new(),
             regions: BTreeMap::new(),

@@ -167,7 +167,7 @@ impl Interpreter {
                     Err(error) => self.ended(thread, id, ABORTED, wrong("its predicate", &error)),
                 }
             }
-            StateKind::Concurrency { regions, .. } => self.fork(thread, id, path, regions),
+            StateKind::Concurrency { regions, .. } => self.fork(context.plan, thread, id, path, regions),
         }
     }
 

@@ -56,6 +56,8 @@ pub(crate) struct Plan {
 /// The plan of one state.
 #[derive(Debug)]
 pub(crate) struct StatePlan {
+    /// Its place in the order in which the states are written: 0 for the root. A state stands before what it contains.
+    pub(crate) place: u64,
     /// Its effect on the environment, including everything inside of it.
     pub(crate) nature: NodeNature,
     /// An action or a routine: executed as one node.
@@ -154,6 +156,13 @@ impl Plan {
         let states: Vec<StatePlan> = program.states.iter().map(of).collect();
         let (width, buckets) = (names.numbers.len() + 2, Plan::buckets(program.horizon));
         let mut plan = Plan { states, crossing, width, buckets, names };
+        let mut open = vec![Program::ROOT];
+        for place in 0.. {
+            let Some(id) = open.pop() else { break };
+            plan.states[index(id)].place = place;
+            let inside: Vec<StateId> = program.state(id).children().collect();
+            open.extend(inside.into_iter().rev());
+        }
         for (id, kept) in improves::of(program, &plan) {
             plan.states[index(id)].improves = Some(kept);
         }
@@ -223,6 +232,7 @@ impl StatePlan {
         let around = around.map(|around| &around.kind);
         let exceptions = state.annotations.exceptions.unwrap_or(program.exceptions);
         StatePlan {
+            place: 0,
             nature,
             is_node: subject.is_node,
             is_routine: subject.is_routine(),

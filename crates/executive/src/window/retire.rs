@@ -47,21 +47,28 @@ struct News {
     is_open: bool,
 }
 
-/// Whether a head ends something that began before: the sequential program follows all ends, then looks at waits, and only then begins
-/// states.
-fn is_end(role: Option<Role>) -> bool {
-    matches!(role, Some(Role::Exit | Role::Test | Role::RegionEnd | Role::Join | Role::End))
+/// Whether a head ends something that began before, now: the sequential program follows all ends, then looks at waits, and only then begins states.
+/// If it enters a state on its way to the head, that is where it begins.
+fn is_end(head: &Instance) -> bool {
+    match head.role() {
+        Some(Role::Exit | Role::Test | Role::RegionEnd | Role::Join | Role::End) => head.visits_before == 0,
+        Some(Role::Condition | Role::Loop | Role::Entry | Role::Fork) => false,
+        None => head.ended().is_some() && head.node().is_some_and(|node| ends_now(head, node)),
+    }
+}
+
+/// Whether a node that has ended has done so at its place. What has run ahead, or takes over a known result, ends later in the sequential program.
+fn ends_now(head: &Instance, node: &Node) -> bool {
+    head.is_pia() || node.is_at_its_place && (node.has_acted || node.answer.is_none())
 }
 
 impl Window {
-    /// Retires everything that can retire; true if anything did. All lines come up to their next node before a node retires: in the sequential
-    /// program a node that begins now ends later, when the other regions have gone on, too.
+    /// Retires everything that can retire; true if anything did. All lines come up to their next node before a node retires that has run ahead: in
+    /// the sequential program a node that begins now ends later, when the other regions have gone on, too.
     pub(super) fn retire(&mut self, context: &mut Context<'_>) -> bool {
         let mut retired = false;
         loop {
-            while self.retire_lines(context, Window::come_to_node) {
-                retired = true;
-            }
+            retired |= self.come_to_nodes(context);
             if !self.retire_lines(context, Window::retire_node) {
                 return retired;
             }
@@ -69,7 +76,7 @@ impl Window {
         }
     }
 
-    /// Lets one line after the other retire something; true if any did.
+    /// Lets one line after the other retire something; true if any did. Where a line comes to its end, the line around it goes on next.
     fn retire_lines(
         &mut self,
         context: &mut Context<'_>,
@@ -78,39 +85,81 @@ impl Window {
         let mut retired = false;
         let mut last = None;
         while let Some(line) = self.graph.next_active_line(last) {
-            last = Some(line);
             retired |= retires(self, context, line);
+            last = self.graph.has_line(line).then_some(line);
         }
         retired
     }
 
-    /// Retires what comes before the next node of a line; true if there was anything.
-    fn come_to_node(&mut self, context: &mut Context<'_>, line: LineId) -> bool {
+    /// Retires what comes before the next nodes of the lines, as the sequential program goes on: it follows all ends, ends one wait if one is over and
+    /// follows that, and only then the first line begins its next state. True if there was anything.
+    fn come_to_nodes(&mut self, context: &mut Context<'_>) -> bool {
+        let mut retired = false;
+        loop {
+            while self.end.is_none() && (self.retire_lines(context, Window::follow_ends) || self.ends_a_wait(context)) {
+                retired = true;
+            }
+            let mut last = None;
+            loop {
+                let Some(line) = self.graph.next_active_line(last).filter(|_| self.end.is_none()) else {
+                    return retired;
+                };
+                if !self.begin_next(context, line) {
+                    last = Some(line);
+                    continue;
+                }
+                retired = true;
+                // What has ended with it may end waits, or let the line around it go on.
+                self.follow_ends(context, line);
+                if !self.graph.has_line(line) || self.ends_a_wait(context) {
+                    break;
+                }
+            }
+        }
+    }
+
+    /// Retires the ends at which a line stands; true if there were any.
+    fn follow_ends(&mut self, context: &mut Context<'_>, line: LineId) -> bool {
         let mut retired = false;
         while self.end.is_none() {
             // A decision that depends on facts changed by another region must be made again before it retires.
             retired |= self.tell_of_crossings(context);
-            let Some(head) = self.graph.head_of(line).and_then(|id| self.graph.get(id)) else { break };
-            let (id, role, has_ended) = (head.id, head.role(), head.ended().is_some());
-            if !is_end(role) && self.ends_a_wait(context) {
-                retired = true;
+            if self.graph.lacks_head(line) && self.grow(context) {
                 continue;
             }
-            // The sequential program goes on here before it goes on in the next region.
+            let Some(head) = self.graph.head_of(line).and_then(|id| self.graph.get(id)) else { break };
+            if !is_end(head) {
+                break;
+            }
+            let (id, has_ended) = (head.id, head.ended().is_some());
             if self.waits.takes(&mut self.graph, id) {
                 self.examine(context, id);
-                continue;
-            }
-            if role.is_none() {
-                self.come_to_its_place(context, id);
+            } else if has_ended && self.retire_head(context, id) {
+                retired = true;
+            } else {
                 break;
             }
-            if !has_ended || !self.retire_head(context, id) {
-                break;
-            }
-            retired = true;
         }
         retired
+    }
+
+    /// Begins the next state of a line, or a part of that; true if there was anything to begin.
+    fn begin_next(&mut self, context: &mut Context<'_>, line: LineId) -> bool {
+        self.tell_of_crossings(context);
+        let Some(head) = self.graph.head_of(line).and_then(|id| self.graph.get(id)).filter(|head| !is_end(head)) else {
+            return false;
+        };
+        let (id, is_node, has_ended) = (head.id, head.role().is_none(), head.ended().is_some());
+        // The sequential program goes on here before it goes on in the next region.
+        if self.waits.takes(&mut self.graph, id) {
+            self.examine(context, id);
+            return true;
+        }
+        if is_node {
+            self.come_to_its_place(context, id);
+            return self.graph.get(id).is_some_and(is_end);
+        }
+        has_ended && self.retire_head(context, id)
     }
 
     /// Retires the head of a line, or passes it over, if it is a node; true if it did.

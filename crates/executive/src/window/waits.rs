@@ -237,9 +237,14 @@ impl Waits {
         self.timers.insert((at, timer));
     }
 
-    /// The next timer that is due; among timeouts of one moment the one on the first line.
+    /// The next timer that is due: the deadline before all others, and among timeouts of one moment the one on the first line.
     pub(crate) fn next_due(&mut self, graph: &Graph, now: Timestamp) -> Option<Timer> {
         let first = *self.timers.first().filter(|(at, _)| *at <= now)?;
+        let mut due = self.timers.iter().take_while(|(at, _)| *at <= now);
+        if let Some(deadline) = due.find(|(_, timer)| *timer == Timer::Deadline).copied() {
+            self.timers.remove(&deadline);
+            return Some(deadline.1);
+        }
         let alike = self.timers.iter().take_while(|(at, timer)| {
             *at == first.0 && std::mem::discriminant(timer) == std::mem::discriminant(&first.1)
         });
