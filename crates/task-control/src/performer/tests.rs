@@ -196,17 +196,31 @@ impl Bench {
     }
 
     /// Takes up the log's open items, as a resumption does: the loss of its leases is logged before.
-    async fn takes_up(&mut self, mut ledger: Ledger, mirror: &World) -> anyhow::Result<Vec<Event>> {
+    async fn takes_up(&mut self, ledger: Ledger, mirror: &World) -> anyhow::Result<Vec<Event>> {
+        let mut told = Vec::new();
+        let more = self.takes_up_saying(ledger, mirror, |event| told.push(event.clone())).await?;
+        Ok(told.into_iter().chain(more).collect())
+    }
+
+    /// The same; `log` gets what has to be in the log before the operations.
+    async fn takes_up_saying(
+        &mut self,
+        mut ledger: Ledger,
+        mirror: &World,
+        log: impl FnMut(&Event),
+    ) -> anyhow::Result<Vec<Event>> {
         self.loses(&mut ledger).await?;
-        let now = ledger.last;
-        self.performer.take_up(&fetch_boxes(), ledger, mirror, now).await
+        let (now, program) = (ledger.last, fetch_boxes());
+        let (told, taken) = self.performer.take_up(&program, ledger, mirror, now).await?;
+        told.iter().for_each(log);
+        self.performer.go_on(&program, taken).await
     }
 
     /// Performs what a run that has ended had decided.
     async fn finishes(&mut self, mut ledger: Ledger) -> anyhow::Result<(usize, usize)> {
         self.loses(&mut ledger).await?;
         let now = ledger.last;
-        self.performer.finish(&fetch_boxes(), ledger, now).await
+        self.performer.finish(&fetch_boxes(), ledger, now, |_| Ok(())).await
     }
 
     async fn loses(&self, ledger: &mut Ledger) -> anyhow::Result<()> {
@@ -1336,7 +1350,15 @@ impl Operating {
         std::mem::replace(&mut self.bench.performer, again).session.close().await;
         self.bench.performer = connect_as(&self.bench.endpoints, &run, Some(before), "task", events).await?;
         self.bench.answers = answers;
-        self.bench.takes_up(self.ledger.clone(), &World::default()).await
+        let mut told = Vec::new();
+        let open = self.ledger.clone();
+        match self.bench.takes_up_saying(open, &World::default(), |event| told.push(event.clone())).await {
+            Ok(more) => Ok(told.into_iter().chain(more).collect()),
+            Err(refused) => {
+                told.iter().for_each(|event| self.ledger.event(Timestamp(0), event));
+                Err(refused)
+            }
+        }
     }
 
     /// The free units of each resource of a kind; `own` is a resource that the run has created.
@@ -1396,6 +1418,21 @@ async fn a_deletion_of_more_than_a_run_has_created_is_done_when_it_comes_back() 
     run.decides(Requirement { count: 2.into(), ..delete("Box") });
     run.comes_back().await?;
     assert_eq!(run.free("Box").await?, of(&[("operators", 1)]));
+    run.bench.performer.closed().await
+}
+
+#[tokio::test]
+async fn what_was_made_anew_and_deleted_is_not_made_anew_where_the_next_operation_was_refused() -> anyhow::Result<()> {
+    let mut run = Operating::new(ResourceManagerConfig::default()).await?;
+    run.there_is("operators", "Box", 1).await?;
+    run.does(create("Box", 2)).await?;
+    run.decides(Requirement { count: 2.into(), ..delete("Box") });
+    run.decides(consume("Glue"));
+    let refused = run.comes_back().await.err().context("there is no glue")?;
+    assert!(refused.to_string().contains("cannot be done now"), "{refused}");
+    run.there_is("glue", "Glue", 1).await?;
+    run.comes_back().await?;
+    assert_eq!((run.free("Box").await?, run.free("Glue").await?), (of(&[("operators", 1)]), of(&[("glue", 0)])));
     run.bench.performer.closed().await
 }
 
@@ -1707,7 +1744,9 @@ async fn taken_up_once() -> anyhow::Result<(Bench, Ledger, u64)> {
     bench.performer.world.commit("other/i1/1", by_others("done"), None).await?;
     let mut bench = bench.comes_back(false).await?;
     bench.loses(&mut ledger).await?;
-    let told = bench.performer.take_up(&fetch_boxes(), ledger.clone(), &World::default(), Timestamp(0)).await?;
+    let program = fetch_boxes();
+    let (mut told, taken) = bench.performer.take_up(&program, ledger.clone(), &World::default(), Timestamp(0)).await?;
+    told.extend(bench.performer.go_on(&program, taken).await?);
     told.iter().for_each(|event| ledger.event(Timestamp(0), event));
     let again = start(InstanceId(2), 2, "work", LeaseId(2), "");
     for command in [again, commits_what(2, 2, by_others("tidy"))] {
@@ -1996,7 +2035,7 @@ async fn behind_what_had_failed_nothing_is_made_by_who_comes_back() -> anyhow::R
     assert_eq!((missing_commits(&place, &ledger).await?, ledger.open_operations().count()), (Some(0), 0));
     let (events, _answers) = mpsc::channel(8);
     let mut late = connect_as(&bench.endpoints, &run, None, "task", events).await?;
-    assert_eq!(late.finish(&fetch_boxes(), ledger, Timestamp(0)).await?, (0, 0));
+    assert_eq!(late.finish(&fetch_boxes(), ledger, Timestamp(0), |_| Ok(())).await?, (0, 0));
     assert_eq!(late.root().await?.0, Revision(1));
     late.closed().await?;
     bench.performer.closed().await
@@ -2077,7 +2116,7 @@ async fn of_a_run_that_has_ended_what_was_not_recorded_is_made_and_nothing_else(
     // The session is over, and with it the resources that it had created.
     let (events, _answers) = mpsc::channel(1);
     let mut late = connect_as(&bench.endpoints, &run, Some(session), "task", events).await?;
-    assert_eq!(late.finish(&fetch_boxes(), ledger.clone(), Timestamp(0)).await?, (0, 0));
+    assert_eq!(late.finish(&fetch_boxes(), ledger.clone(), Timestamp(0), |_| Ok(())).await?, (0, 0));
     assert!(late.resources.list(&["Box"]).await?.is_empty());
     late.closed().await?;
     let other = Ledger { first_revision: Revision(9), ..ledger };
