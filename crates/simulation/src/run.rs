@@ -22,7 +22,7 @@ use ratn_model::resource::{Quantity, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
-use ratn_resources::{AcquireRequest, Limits, Notice, Pool, ResourceSpec, SessionId, WaiterId};
+use ratn_resources::{AcquireRequest, Kinds, Limits, Notice, Pool, ResourceSpec, SessionId, WaiterId};
 use ratn_world::world::World;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -244,7 +244,8 @@ pub fn run_while(
         setup.world.iter().map(|(fact, value)| Change::Set { fact: fact.clone(), value: value.clone() }).collect();
     let broken = |at: Timestamp, problem: String| RunError::Broken { at_s: at.seconds(), problem };
     root.apply(&initial).map_err(|e| broken(Timestamp(0), e.to_string()))?;
-    let mut pool = Pool::new(Limits::default());
+    let kinds = Kinds::new(&setup.program.kinds).map_err(|error| broken(Timestamp(0), error.to_string()))?;
+    let mut pool = Pool::new(Limits::default()).with_kinds(kinds);
     let session = SessionId::from("task");
     let forever = Duration::from_secs(10 * 365 * 24 * 3600);
     pool.keep_alive(Timestamp(0), &session, "simulation", forever).map_err(|e| broken(Timestamp(0), e.to_string()))?;

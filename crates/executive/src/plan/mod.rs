@@ -346,9 +346,10 @@ impl Names {
         next
     }
 
-    /// The number of the task resources of a kind, under a name that no predicate can have.
-    fn of_kind(&mut self, kind: &str) -> Predicate {
-        self.of_predicate(&format!("#{kind}"))
+    /// The number of the task resources of a kind and of all related kinds, under a name that no predicate can have.
+    fn of_kind(&mut self, program: &Program, kind: &str) -> Predicate {
+        let family = program.family(kind);
+        self.of_predicate(&format!("#{}", family.first().unwrap_or(&kind)))
     }
 }
 
