@@ -435,7 +435,13 @@ impl Simulation<'_> {
                 self.lose(lease)?;
                 // In reality the goal under the lease ends before another one begins there.
                 self.busy.given_back(lease).ok();
-                Event::Crashed { instance, attempt, reason: "its lease was lost".to_owned(), unknown: false }
+                Event::Crashed {
+                    instance,
+                    attempt,
+                    reason: "its lease was lost".to_owned(),
+                    unknown: false,
+                    refused: false,
+                }
             }
         };
         if let Event::WorldChanged { facts, .. } = &event {
@@ -682,9 +688,13 @@ impl Simulation<'_> {
                 let evidence = Vec::new();
                 Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason }
             }
-            Answer::Crashed => {
-                Event::Crashed { instance, attempt, reason: "the worker died".to_owned(), unknown: false }
-            }
+            Answer::Crashed => Event::Crashed {
+                instance,
+                attempt,
+                reason: "the worker died".to_owned(),
+                unknown: false,
+                refused: false,
+            },
             Answer::LeaseLost => {
                 let lease = goal.lease.as_ref().map(|lease| lease.id);
                 match lease.filter(|lease| self.leases.get(lease) == Some(&instance)) {
@@ -694,7 +704,13 @@ impl Simulation<'_> {
                         return;
                     }
                     // Inside of a routine only the worker dies.
-                    None => Event::Crashed { instance, attempt, reason: "the worker died".to_owned(), unknown: false },
+                    None => Event::Crashed {
+                        instance,
+                        attempt,
+                        reason: "the worker died".to_owned(),
+                        unknown: false,
+                        refused: false,
+                    },
                 }
             }
         };

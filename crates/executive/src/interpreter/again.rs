@@ -83,9 +83,15 @@ impl Interpreter {
         }
     }
 
-    /// An attempt ended without an answer. A computing or sensing node is tried again, up to its limit. Beyond the limit, and for a PIA, it counts as a
-    /// try that ended `aborted`.
-    pub(super) fn crashed(&mut self, context: &mut Context<'_>, thread: u64, reason: &str, unknown: bool) {
+    /// An attempt ended without an answer. A node that computes or senses, or that was refused and so has not begun, is tried again, up to its limit.
+    /// Beyond the limit, and for a PIA, it counts as a try that ended `aborted`.
+    pub(super) fn crashed(
+        &mut self,
+        context: &mut Context<'_>,
+        thread: u64,
+        reason: &str,
+        (unknown, refused): (bool, bool),
+    ) {
         let Some(current) = self.current(thread) else { return };
         let (attempt, id) = (current.attempt, current.state);
         match current.phase {
@@ -101,7 +107,7 @@ impl Interpreter {
         current.crashes += 1;
         let limit = context.program.state(id).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
         let is_irreversible = context.plan.state(id).nature == NodeNature::Irreversible;
-        if is_irreversible || current.crashes >= limit {
+        if is_irreversible && !refused || current.crashes >= limit {
             // A motion that may have been performed is not repeated.
             if is_irreversible && unknown || !self.is_tried_again(context, thread, true) {
                 self.end_node(context, thread, format!("crashed in attempt {attempt}: {reason}"));

@@ -367,9 +367,9 @@ impl Interpreter {
                     self.run(context, thread);
                 }
             }
-            Event::Crashed { instance, attempt, reason, unknown } => {
+            Event::Crashed { instance, attempt, reason, unknown, refused } => {
                 if let Some(thread) = of(self, instance, Some(attempt)) {
-                    self.crashed(context, thread, &reason, unknown);
+                    self.crashed(context, thread, &reason, (unknown, refused));
                 }
             }
             Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason } => {

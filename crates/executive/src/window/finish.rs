@@ -38,10 +38,10 @@ impl Window {
                 self.goal_ended(context, id, answer);
             }
             (
-                Event::Crashed { reason, unknown, .. },
+                Event::Crashed { reason, unknown, refused, .. },
                 Some(Status::Acquiring { .. } | Status::Granted(_) | Status::Projecting(_) | Status::Running(_)),
             ) => {
-                self.crashed(context, id, &reason, unknown);
+                self.crashed(context, id, &reason, (unknown, refused));
             }
             (event, _) => self.in_routine(context, event),
         }
@@ -198,16 +198,18 @@ impl Window {
     }
 
     /// An attempt has ended without an answer.
-    fn crashed(&mut self, context: &mut Context<'_>, id: InstanceId, reason: &str, unknown: bool) {
+    fn crashed(&mut self, context: &mut Context<'_>, id: InstanceId, reason: &str, (unknown, refused): (bool, bool)) {
         let Some(instance) = self.graph.get(id) else { return };
         let Some(node) = instance.node() else { return };
         let limit = context.program.state(instance.state).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
-        let (is_pia, attempt) = (instance.is_pia(), node.attempt);
+        let (is_pia, is_detached, attempt) = (instance.is_pia(), instance.is_detached(), node.attempt);
         let is_held = is_pia && matches!(node.status, Status::Granted(_));
         // A node that had not begun only loses what it held, and asks again when it may.
         if !is_held {
             let crashes = self.graph.count_crash(id);
-            if is_pia || crashes >= limit {
+            // A motion beside which younger ones go on keeps its place: it counts as tried.
+            let has_not_begun = refused && !is_detached;
+            if is_pia && !has_not_begun || crashes >= limit {
                 let ended = Ended::aborted(format!("crashed in attempt {attempt}: {reason}"));
                 // A motion that may have been performed is not repeated.
                 return if is_pia && unknown {

@@ -231,7 +231,13 @@ impl Outside {
                 let paths = super::paths(run);
                 let mut holders = run.log.iter().filter_map(|line| granted(&line.entry));
                 let instance = holders.find(|instance| paths[instance] == path).unwrap();
-                Event::Crashed { instance, attempt: 1, reason: "its lease was lost".to_owned(), unknown: false }
+                Event::Crashed {
+                    instance,
+                    attempt: 1,
+                    reason: "its lease was lost".to_owned(),
+                    unknown: false,
+                    refused: false,
+                }
             }
             other => panic!("event: one of those above, not {other}"),
         }

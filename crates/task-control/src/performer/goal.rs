@@ -35,6 +35,8 @@ pub(super) const GRACE_MS: u64 = DEFAULT_TTL.as_millis() as u64;
 const WITHDRAWAL_DEADLINE: Duration = Duration::from_secs(DEFAULT_TTL.as_secs() + 1);
 /// Reason code: the provider still runs another run's cancelled goal.
 const STILL_RUNNING: &str = "STILL_RUNNING";
+/// Reason codes of a provider that does not begin a goal because its lease is over.
+const LEASE_OVER: [&str; 2] = ["LEASE_REFUTED", "LEASE_FENCED"];
 /// A worker that refuses for this reason is kept this long before another one is acquired: an immediate acquire would get the same worker again.
 const STILL_RUNNING_PAUSE: Duration = Duration::from_secs(5);
 /// Interval at which the withdrawal of a resource is checked.
@@ -342,7 +344,7 @@ impl Performing {
             },
             _ => said(error),
         };
-        self.crashed(reason)
+        self.crashed(reason, LEASE_OVER.contains(&error.reason()))
     }
 
     /// How the process of a provider ended, according to the process manager of its host; `None` if unknown.
@@ -454,15 +456,15 @@ impl Performing {
         self.finished(GoalOutcome { outputs, reason, ..GoalOutcome::named(ABORTED) })
     }
 
-    fn crashed(&self, reason: String) -> Event {
+    fn crashed(&self, reason: String, refused: bool) -> Event {
         let (instance, attempt, reason) = (self.instance, self.attempt, readable(&reason));
-        Event::Crashed { instance, attempt, reason, unknown: false }
+        Event::Crashed { instance, attempt, reason, unknown: false, refused }
     }
 
     /// A crash after which it is unknown whether the goal was performed.
     fn unknown(&self, reason: String) -> Event {
         let (instance, attempt, reason) = (self.instance, self.attempt, readable(&reason));
-        Event::Crashed { instance, attempt, reason, unknown: true }
+        Event::Crashed { instance, attempt, reason, unknown: true, refused: false }
     }
 }
 
@@ -823,6 +825,24 @@ mod tests {
         assert!(began.elapsed() >= STILL_RUNNING_PAUSE, "{:?}", began.elapsed());
         let Some(Event::Crashed { reason, .. }) = bench.event().await else { anyhow::bail!("no crash") };
         assert!(reason.contains("goal a still runs"), "{reason}");
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn a_goal_that_is_refused_because_its_lease_is_over_was_not_begun() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        for (reason, expected) in [("LEASE_REFUTED", true), ("LEASE_FENCED", true), ("LEASE_UNKNOWN", false)] {
+            let bound = bind(&Endpoint::Unix(bench._place.path().join(format!("{reason}.sock")))).await?;
+            let mut performing = bench.performing("work", None, 0);
+            performing.endpoint = Ok(bound.endpoint().clone());
+            let details = ErrorDetails::with_error_info(reason, "ratn", HashMap::<String, String>::new());
+            let status = Status::with_error_details(Code::FailedPrecondition, "lease-1 is over", details);
+            let services = Services::new().with(ActionServiceServer::new(Elsewhere(Err(status))));
+            tokio::spawn(bound.serve(services, CancellationToken::new()));
+            performing.perform(Given::Now).await;
+            let Some(Event::Crashed { refused, .. }) = bench.event().await else { anyhow::bail!("no crash: {reason}") };
+            assert_eq!(refused, expected, "{reason}");
+        }
         Ok(())
     }
 
