@@ -320,6 +320,17 @@ impl Interpreter {
         }
     }
 
+    /// A routine at its place goes on with its own changes of the world as it is now: everything before it is real.
+    pub(crate) fn project_anew(&mut self, root: &World) {
+        if let Target::Projection { base, changes, writers, before, world, .. } = &mut self.target
+            && let Ok(projected) = root.project(&changes[*before..])
+        {
+            changes.drain(..*before);
+            writers.drain(..*before);
+            (*base, *before, *world) = (root.revision(), 0, projected);
+        }
+    }
+
     /// Calls `use_scope` with the scope of the outermost state: its parameters, and the outputs of the executed states.
     pub(crate) fn in_scope<T>(
         &self,
