@@ -282,17 +282,32 @@ impl Interpreter {
         self.threads.values().flat_map(|thread| &thread.current).any(|current| current.phase == Phase::Acquiring)
     }
 
-    /// Begins with `state`, visited at `path`.
+    /// Begins with `state`, visited at `path`, and goes on.
     pub(crate) fn start(&mut self, context: &mut Context<'_>, state: StateId, path: &str) -> Progress {
-        if let Some(main) = self.threads.get_mut(&MAIN) {
-            main.todo = Todo::Enter(state, Some(path.to_owned()));
-        }
-        self.go_on_with(context)
+        self.begin_with(context, state, path);
+        self.advance(context)
+    }
+
+    /// Begins with `state`, visited at `path`.
+    pub(crate) fn begin_with(&mut self, context: &mut Context<'_>, state: StateId, path: &str) {
+        self.set(MAIN, Todo::Enter(state, Some(path.to_owned())));
+        self.begin_next(context);
     }
 
     /// Whether this instance is under way here.
     pub(crate) fn is_at(&self, instance: InstanceId) -> bool {
-        self.threads.values().flat_map(|thread| &thread.current).any(|current| current.instance == instance)
+        self.thread_of(instance).is_some()
+    }
+
+    /// The thread that an instance is under way in.
+    fn thread_of(&self, instance: InstanceId) -> Option<u64> {
+        let is_at = |thread: &Thread| thread.current.as_ref().is_some_and(|current| current.instance == instance);
+        self.threads.iter().find(|(_, thread)| is_at(thread)).map(|(id, _)| *id)
+    }
+
+    /// Whether what it does is real at once.
+    pub(crate) fn is_actual(&self) -> bool {
+        matches!(self.target, Target::Actual)
     }
 
     /// Whether it has ended because a thread went in circles (too many visits without an action).
@@ -340,24 +355,40 @@ impl Interpreter {
         self.with_scope(context, MAIN, None, use_scope)
     }
 
-    /// Handles an event for an instance under way, for all of them, or from the operator; ignores the others.
+    /// Handles what is due, then an event.
     pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Progress {
-        // The operator was told that the answer has arrived: a timeout at this very moment does not discard it.
-        if let Event::Answered { instance, choice } = &event {
-            self.answered(context, *instance, choice);
+        let mut progress = self.before(context, &event);
+        while progress == Progress::Busy && self.next_due(context.now).is_some() {
+            progress = self.fall_due(context);
         }
+        if progress == Progress::Busy {
+            self.take(context, event);
+            progress = self.advance(context);
+        }
+        if progress == Progress::Busy {
+            self.renew_leases(context);
+        }
+        progress
+    }
+
+    /// What comes before everything that is due: an answer, because the operator was told that it has arrived.
+    pub(crate) fn before(&mut self, context: &mut Context<'_>, event: &Event) -> Progress {
         self.has_changed = true;
-        let progress = self.look_at_the_time(context);
-        if progress != Progress::Busy {
-            return progress;
-        }
+        let Event::Answered { instance, choice } = event else { return Progress::Busy };
+        self.answered(context, *instance, choice);
+        self.advance(context)
+    }
+
+    /// Takes an event for an instance under way, for all of them, or from the operator; ignores the others. What follows from it is left to do.
+    pub(crate) fn take(&mut self, context: &mut Context<'_>, event: Event) {
+        self.has_changed = true;
         let of = |interpreter: &Interpreter, id: InstanceId, attempt: Option<u32>| {
-            let at = |thread: &Thread| {
-                thread.current.as_ref().is_some_and(|c| c.instance == id && attempt.is_none_or(|a| a == c.attempt))
-            };
-            interpreter.threads.iter().find(|(_, thread)| at(thread)).map(|(thread, _)| *thread)
+            let is_at = |current: &Current| attempt.is_none_or(|attempt| attempt == current.attempt);
+            let is_meant = |thread: &u64| interpreter.threads[thread].current.as_ref().is_some_and(is_at);
+            interpreter.thread_of(id).filter(is_meant)
         };
         match event {
+            Event::Answered { instance, choice } => self.answered(context, instance, &choice),
             Event::Granted { instance, lease } => {
                 if let Some(thread) = of(self, instance, None) {
                     self.granted(context, thread, lease);
@@ -406,11 +437,6 @@ impl Interpreter {
             }
             _ => {}
         }
-        let progress = self.go_on_with(context);
-        if progress == Progress::Busy {
-            self.renew_leases(context);
-        }
-        progress
     }
 
     pub(crate) fn break_at(&mut self, program: &Program, breakpoints: Vec<String>) {

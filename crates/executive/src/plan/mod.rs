@@ -70,8 +70,6 @@ pub(crate) struct StatePlan {
     pub(crate) imprecise: bool,
     /// It waits, or something that it contains does.
     pub(crate) waits: bool,
-    /// A change of the world may end it or a part of it: a wait, or a watched motion.
-    pub(crate) is_watched: bool,
     /// Of an action: the name of its provider and its own name.
     pub(crate) action: Option<(Arc<str>, Arc<str>)>,
 
@@ -242,7 +240,6 @@ impl StatePlan {
                 && !is_watched
                 && !is_before_finally,
             waits,
-            is_watched,
             action: match &state.kind {
                 StateKind::Action { provider, action, .. } => Some((Arc::from(&**provider), Arc::from(&**action))),
                 _ => None,

@@ -12,6 +12,7 @@ use super::waits::Wait;
 use crate::binding;
 use crate::context::{Context, MAX_IDLE_VISITS, Made, in_circles};
 use crate::effects;
+use crate::interpreter::Interpreter;
 use crate::plan::{Effects, NodeNature, Outcome, SUCCEEDED, gives_outputs};
 use crate::protocol::{Command, Note};
 use ratn_model::fact::{Change, FactKey};
@@ -102,6 +103,9 @@ impl Window {
             let mut last = None;
             loop {
                 let Some(line) = self.graph.next_active_line(last).filter(|_| self.end.is_none()) else {
+                    if self.take_turns(context) {
+                        break;
+                    }
                     return retired;
                 };
                 if !self.begin_next(context, line) {
@@ -118,6 +122,21 @@ impl Window {
         }
     }
 
+    /// Begins, inside of routines, what has waited there for its turn at the routine's units; true if there was anything.
+    fn take_turns(&mut self, context: &mut Context<'_>) -> bool {
+        let heads = self.graph.active_heads().map(|head| head.id).filter(|id| self.goes_on_in_turn(*id));
+        heads.collect::<Vec<_>>().into_iter().any(|id| {
+            let takes = |routine: &mut Interpreter, context: &mut Context<'_>| {
+                let takes = routine.take_turns(context);
+                if !takes {
+                    routine.renew_leases(context);
+                }
+                takes
+            };
+            self.end.is_none() && self.with_routine(context, id, takes) == Some(true)
+        })
+    }
+
     /// Retires the ends at which a line stands; true if there were any.
     fn follow_ends(&mut self, context: &mut Context<'_>, line: LineId) -> bool {
         let mut retired = false;
@@ -127,11 +146,13 @@ impl Window {
             if self.graph.lacks_head(line) && self.grow(context) {
                 continue;
             }
-            let Some(head) = self.graph.head_of(line).and_then(|id| self.graph.get(id)) else { break };
-            if !is_end(head) {
-                break;
+            let Some(id) = self.graph.head_of(line) else { break };
+            if self.goes_on_in_turn(id) && self.with_routine(context, id, Interpreter::follow_end) == Some(true) {
+                retired = true;
+                continue;
             }
-            let (id, has_ended) = (head.id, head.ended().is_some());
+            let Some(head) = self.graph.get(id).filter(|head| is_end(head)) else { break };
+            let has_ended = head.ended().is_some();
             if self.waits.takes(&mut self.graph, id) {
                 self.examine(context, id);
             } else if has_ended && self.retire_head(context, id) {
@@ -154,6 +175,9 @@ impl Window {
         if self.waits.takes(&mut self.graph, id) {
             self.examine(context, id);
             return true;
+        }
+        if self.goes_on_in_turn(id) {
+            return self.with_routine(context, id, Interpreter::begin_next) == Some(true);
         }
         if is_node {
             self.come_to_its_place(context, id);

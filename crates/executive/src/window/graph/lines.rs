@@ -14,6 +14,13 @@ pub(crate) struct LineId {
     number: u64,
 }
 
+impl LineId {
+    /// The place of its region in the program.
+    pub(crate) fn place(self) -> u64 {
+        self.place
+    }
+}
+
 /// The task's own line.
 pub(crate) const MAIN: LineId = LineId { place: 0, number: 0 };
 
