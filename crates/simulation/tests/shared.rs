@@ -73,21 +73,29 @@ impl Writer {
         self.line(depth, &format!("- w{number}: {{ {what} }}"));
     }
 
-    /// States that change something shared when they are left, or regions of which one has the unit.
+    /// States that change something shared when they are left, or with a limit; or regions of which one has the unit, or a race.
     fn around(&mut self, depth: usize, within: u64) {
         self.names += 1;
         let (name, fact, number) = (format!("a{}", self.names), self.fact(), self.below(3));
         self.line(depth, &format!("- {name}:"));
         let inside = depth + 2;
-        if self.below(2) == 0 {
+        let kind = self.below(5);
+        if kind < 2 {
             let effect = if number == 0 { format!("increase {fact} by 1") } else { format!("{fact} = {}", number - 1) };
             self.line(inside, &format!("effects: ['{effect}']"));
             self.line(inside, "states:");
             return self.parts(inside + 1, within - 1, 2);
         }
-        self.line(inside, "concurrency: barrier");
+        if kind == 2 {
+            self.line(inside, "timeout: 1000");
+            self.line(inside, "states:");
+            return self.parts(inside + 1, within - 1, 2);
+        }
+        // Of a race nothing moves that could be cut short.
+        let (unit, with, is_race) = (self.actuator, self.below(2), kind == 4);
+        self.line(inside, if is_race { "concurrency: preemptive" } else { "concurrency: barrier" });
         self.line(inside, "regions:");
-        let (unit, with) = (self.actuator, self.below(2));
+        let with = if is_race { 2 } else { with };
         for region in 0..2 {
             self.actuator = unit.filter(|_| region == with);
             self.line(inside + 1, &format!("- {name}_{region}:"));
