@@ -326,7 +326,15 @@ impl Window {
     /// An instance ended otherwise than computed ahead: discards everything behind it and continues the path where its outcome leads.
     fn leave_path(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: Outcome, reason: String) {
         let path = self.path(context.program, id);
-        let because: Arc<str> = if reason.is_empty() { path.into() } else { format!("{path}: {reason}").into() };
+        // A routine that was under way says where inside of it.
+        let says_where = self.graph.get(id).is_some_and(|instance| {
+            context.plan.state(instance.state).is_routine && instance.node().is_some_and(|node| node.has_acted)
+        });
+        let because: Arc<str> = match reason.is_empty() {
+            true => path.into(),
+            false if says_where => reason.into(),
+            false => format!("{path}: {reason}").into(),
+        };
         self.cut_behind(context, id);
         self.remove_and_depart(context, id, outcome, because);
     }
