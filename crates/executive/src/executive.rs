@@ -14,6 +14,7 @@ use crate::plan::Plan;
 use crate::protocol::{Command, Event, Mode};
 use crate::signals::Signals;
 use crate::span::span;
+use crate::turn::Turn;
 use crate::way_out::{Leaving, WayOut};
 use crate::window::{End, Window};
 use order::in_order;
@@ -24,6 +25,7 @@ use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS};
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
+use ratn_model::wait::Wait;
 use ratn_world::world::World;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -43,7 +45,7 @@ pub struct Executive {
     last_instance: u64,
     seed: u64,
     signals: Signals,
-    /// Deadline of the run, in HSM mode.
+    /// Deadline of the run.
     deadline: Option<Timestamp>,
     state: State,
 }
@@ -107,6 +109,19 @@ impl Executive {
     /// Number of signals of a name that no state has taken yet; at most [`crate::MOST_SIGNALS_KEPT`] are kept.
     pub fn signals_kept(&self, name: &str) -> usize {
         self.signals.count(name)
+    }
+
+    /// The wait under way that the next signal of a name ends.
+    pub fn first_waiting_for(&self, signal: &str) -> Option<InstanceId> {
+        let waits = match &self.state {
+            State::Cdtn(window) => window.waits_under_way(&self.program).map(|(turn, _)| turn).collect(),
+            State::Hsm(interpreter) => interpreter.waits(&self.program, 0).collect(),
+            State::Leaving(leaving) => leaving.waits(&self.program),
+            State::Fresh | State::Ended => Vec::new(),
+        };
+        let is_it =
+            |turn: &Turn| matches!(self.program.state(turn.state).wait(), Some(Wait::Signal(name)) if name == signal);
+        waits.into_iter().filter(is_it).min().map(|turn| turn.instance)
     }
 
     /// The breakpoints, by the paths of states.
@@ -220,11 +235,10 @@ impl Executive {
             commands.push(Command::End { outcome: ABORTED.to_owned(), outputs: BTreeMap::new(), reason });
             return;
         }
+        self.deadline = program.deadline_s.map(|seconds| now + span(seconds));
+        context.commands.extend(self.deadline.map(|at| Command::Wake { at }));
         let end = match window {
             None => {
-                let seconds = program.deadline_s.map(span);
-                self.deadline = seconds.map(|seconds| now + seconds);
-                context.commands.extend(self.deadline.map(|at| Command::Wake { at }));
                 let mut interpreter = Box::new(Interpreter::of_program(parameters));
                 interpreter.break_at(&program, breakpoints);
                 let progress = interpreter.start(&mut context, Program::ROOT, "");
@@ -264,25 +278,17 @@ impl Executive {
             signals: &mut self.signals,
             commands,
         };
-        // The deadline is handled before an event that arrives after it.
+        // What is due is handled before an event that arrives after it.
         let mut after = None;
-        let end = match &mut self.state {
-            State::Fresh | State::Ended => None,
-            State::Cdtn(window) => match window.before(&mut context, &event) {
-                None => window.handle(&mut context, event),
-                end => {
-                    after = Some(event);
-                    end
-                }
-            },
-            State::Leaving(leaving) => leaving.handle(&mut context, event),
-            State::Hsm(interpreter) if self.deadline.is_some_and(|deadline| deadline <= now) => {
-                let limit = program.deadline_s.unwrap_or_default();
-                let reason = format!("the task took longer than its deadline of {limit} s");
+        let end = match (come_to_now(&mut context, &mut self.state, self.deadline, &event), &mut self.state) {
+            (Some(end), _) => {
                 after = Some(event);
-                Some(cut_short(&mut context, interpreter, ABORTED, reason))
+                Some(end)
             }
-            State::Hsm(interpreter) => match event {
+            (None, State::Fresh | State::Ended) => None,
+            (None, State::Cdtn(window)) => window.handle(&mut context, event),
+            (None, State::Leaving(leaving)) => leaving.handle(&mut context, event),
+            (None, State::Hsm(interpreter)) => match event {
                 Event::AbortRequested { reason, at_once: false } => {
                     Some(cut_short(&mut context, interpreter, PREEMPTED, reason))
                 }
@@ -320,6 +326,46 @@ impl Executive {
             commands.push(Command::End { outcome, outputs, reason });
         }
     }
+}
+
+/// Handles what has fallen due, one after the other, each with all that follows from it; returns the end of the run if that ended it. The deadline is
+/// one of them, and of those of one moment the first.
+fn come_to_now(
+    context: &mut Context<'_>,
+    state: &mut State,
+    deadline: Option<Timestamp>,
+    event: &Event,
+) -> Option<End> {
+    let mut end = match state {
+        State::Hsm(interpreter) => {
+            let progress = interpreter.before(context, event);
+            end_of(context, interpreter, progress)
+        }
+        State::Cdtn(window) => window.before(context, event),
+        State::Fresh | State::Leaving(_) | State::Ended => None,
+    };
+    while end.is_none() {
+        let due = match state {
+            State::Hsm(interpreter) => interpreter.next_due(context.now),
+            State::Cdtn(window) => window.next_due(context.now),
+            State::Fresh | State::Leaving(_) | State::Ended => return None,
+        };
+        let is_over = deadline.is_some_and(|deadline| deadline <= due.unwrap_or(context.now));
+        let limit = context.program.deadline_s.unwrap_or_default();
+        let reason = || format!("the task took longer than its deadline of {limit} s");
+        end = match state {
+            State::Hsm(interpreter) if is_over => Some(cut_short(context, interpreter, ABORTED, reason())),
+            State::Cdtn(window) if is_over => window.end_early(context, reason()),
+            _ if due.is_none() => return None,
+            State::Hsm(interpreter) => {
+                let progress = interpreter.fall_due(context);
+                end_of(context, interpreter, progress)
+            }
+            State::Cdtn(window) => window.fall_due(context),
+            State::Fresh | State::Leaving(_) | State::Ended => None,
+        };
+    }
+    end
 }
 
 /// Cancels everything under way; the end returned contains the way out.

@@ -38,6 +38,7 @@ mod plan;
 pub mod protocol;
 mod signals;
 mod span;
+mod turn;
 mod way_out;
 mod window;
 

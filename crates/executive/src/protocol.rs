@@ -267,6 +267,9 @@ pub enum Event {
         /// Whether the goal may have been performed: task control was down when it ended. A motion is then not tried again.
         #[serde(default, skip_serializing_if = "std::ops::Not::not")]
         unknown: bool,
+        /// Whether the provider refused the goal because its lease was over: nothing was begun.
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        refused: bool,
     },
     /// The resource manager or the world pool did not perform an operation or commit of a retirement.
     RetirementFailed {

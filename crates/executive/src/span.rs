@@ -2,9 +2,11 @@
 
 use std::time::Duration;
 
-/// A duration of `seconds`. Negative values and NaN give zero; values beyond the range give the longest duration.
+/// A duration of `seconds`, at least 1 ns where they are more than zero: what takes any time is never over at once. Negative values and NaN give zero;
+/// values beyond the range give the longest duration.
 pub(crate) fn span(seconds: f64) -> Duration {
-    Duration::try_from_secs_f64(seconds.max(0.0)).unwrap_or(Duration::MAX)
+    let least = Duration::from_nanos(u64::from(seconds > 0.0));
+    Duration::try_from_secs_f64(seconds.max(0.0)).unwrap_or(Duration::MAX).max(least)
 }
 
 #[cfg(test)]
@@ -17,5 +19,6 @@ mod tests {
         assert_eq!(span(f64::INFINITY), Duration::MAX);
         assert_eq!([span(-1.0), span(f64::NAN)], [Duration::ZERO; 2]);
         assert_eq!(span(1.5), Duration::from_millis(1_500));
+        assert_eq!(span(1e-12), Duration::from_nanos(1));
     }
 }

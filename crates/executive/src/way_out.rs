@@ -16,6 +16,7 @@ use crate::context::Context;
 use crate::hold::Hold;
 use crate::interpreter::{Interpreter, Progress};
 use crate::protocol::{Command, Event};
+use crate::turn::Turn;
 use crate::window::End;
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS};
@@ -165,6 +166,11 @@ impl Leaving {
             }
         }
         self.go_on(context)
+    }
+
+    /// The turns of the waits under way.
+    pub(crate) fn waits(&self, program: &Program) -> Vec<Turn> {
+        self.current.iter().flat_map(|(_, interpreter)| interpreter.waits(program, 0)).collect()
     }
 
     /// The breakpoints; see [`crate::executive::Executive::breakpoints`].

@@ -25,6 +25,10 @@ pub struct Catalogue {
     /// By resource kind, `PathPlanner`.
     #[serde(default)]
     pub resources: BTreeMap<String, ResourceOffer>,
+    /// The direct superclasses of kinds of resources, as the resource manager has them (`[resource-manager.kinds]`): a resource of a kind may be
+    /// meant by a line of a superclass.
+    #[serde(skip)]
+    pub kinds: BTreeMap<String, Vec<String>>,
 }
 
 /// The catalogue of the bundled system, as text.

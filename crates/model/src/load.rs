@@ -267,6 +267,7 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
         initial,
         tolerances,
         ontology: task.ontology.clone(),
+        kinds: catalogue.kinds.clone(),
         states,
         digest,
     };

@@ -11,7 +11,7 @@ use crate::resource::{Quantity, ResourceClass, ResourceOperation};
 use crate::tolerance::Tolerances;
 use crate::value::{Type, Value};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// The outcome of a state that succeeded.
 pub const SUCCESS: &str = "success";
@@ -55,6 +55,9 @@ pub struct Program {
     pub tolerances: Tolerances,
     /// The ontology of its facts; `None` allows all facts.
     pub ontology: Option<Ontology>,
+    /// The direct superclasses of kinds of resources ([`crate::catalogue::Catalogue::kinds`]).
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub kinds: BTreeMap<String, Vec<String>>,
     /// Every state; a [`StateId`] is an index. State 0 is the root, a [`StateKind::Sequence`].
     pub states: Vec<State>,
     /// Hash of the texts of the task file, its ontology and its libraries, hexadecimal.
@@ -392,6 +395,25 @@ impl Program {
 
     /// The default number of branches that are expanded.
     pub const DEFAULT_SPECULATION_WIDTH: usize = 8;
+
+    /// The kinds, the given one included, of which a resource may be meant by a line of the given kind or of a related one: those that the
+    /// hierarchy connects with it. The first one by name stands for all of them.
+    pub fn family<'a>(&'a self, kind: &'a str) -> BTreeSet<&'a str> {
+        let mut family = BTreeSet::from([kind]);
+        let mut open = vec![kind];
+        while let Some(kind) = open.pop() {
+            let above = self.kinds.get(kind).into_iter().flatten();
+            let below =
+                self.kinds.iter().filter(|(_, above)| above.iter().any(|one| one == kind)).map(|(below, _)| below);
+            open.extend(above.chain(below).map(String::as_str).filter(|related| family.insert(*related)));
+        }
+        family
+    }
+
+    /// Whether lines of these two kinds may mean the same resource.
+    pub fn may_be_one(&self, kind: &str, other: &str) -> bool {
+        kind == other || self.family(kind).contains(other)
+    }
 
     /// The state of an id.
     pub fn state(&self, id: StateId) -> &State {

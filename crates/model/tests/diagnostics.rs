@@ -46,6 +46,21 @@ fn a_misspelt_port_is_found_where_it_stands() {
 }
 
 #[test]
+fn regions_that_may_mean_one_resource_by_two_kinds_of_the_hierarchy_are_refused() {
+    let drop = "{ states: [], resources: [{ delete: SmallPen, class: task }] }";
+    let look = "{ states: [], resources: [{ exists: Pen, class: task }] }";
+    let regions = format!("      regions:\n        - drop: {drop}\n        - look: {look}\n");
+    let source = task(&format!("  - both:\n      concurrency: barrier\n{regions}"));
+    let is_refused = |kinds: &[(&str, &str)]| {
+        let kinds = kinds.iter().map(|(kind, above)| ((*kind).to_owned(), vec![(*above).to_owned()])).collect();
+        let findings = load(&source, "task.yaml", &Catalogue { kinds, ..unannotated() }).err().unwrap_or_default();
+        findings.iter().any(|finding| finding.rule == "region-conflict")
+    };
+    assert!(!is_refused(&[]) && !is_refused(&[("SmallPen", "Small")]));
+    assert!(is_refused(&[("SmallPen", "Pen")]) && is_refused(&[("SmallPen", "Small"), ("Pen", "Small")]));
+}
+
+#[test]
 fn an_error_inside_a_quoted_expression_has_its_own_column() {
     let look = "  - look: { action: pan_tilt/look_at, in: { target: \"pose(1, 2, $heigth)\" }, resources: [{block: PanTilt}] }\n";
     let source = format!("task: t\nparameters: {{height: 1.0}}\nstates:\n{look}");

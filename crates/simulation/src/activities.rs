@@ -108,6 +108,7 @@ impl Activities {
             initial: Vec::new(),
             tolerances: Default::default(),
             ontology: None,
+            kinds: Default::default(),
             states,
             digest: String::new(),
         }

@@ -22,7 +22,7 @@ use ratn_model::resource::{Quantity, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
-use ratn_resources::{AcquireRequest, Limits, Notice, Pool, ResourceSpec, SessionId, WaiterId};
+use ratn_resources::{AcquireRequest, Kinds, Limits, Notice, Pool, ResourceSpec, SessionId, WaiterId};
 use ratn_world::world::World;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -244,7 +244,8 @@ pub fn run_while(
         setup.world.iter().map(|(fact, value)| Change::Set { fact: fact.clone(), value: value.clone() }).collect();
     let broken = |at: Timestamp, problem: String| RunError::Broken { at_s: at.seconds(), problem };
     root.apply(&initial).map_err(|e| broken(Timestamp(0), e.to_string()))?;
-    let mut pool = Pool::new(Limits::default());
+    let kinds = Kinds::new(&setup.program.kinds).map_err(|error| broken(Timestamp(0), error.to_string()))?;
+    let mut pool = Pool::new(Limits::default()).with_kinds(kinds);
     let session = SessionId::from("task");
     let forever = Duration::from_secs(10 * 365 * 24 * 3600);
     pool.keep_alive(Timestamp(0), &session, "simulation", forever).map_err(|e| broken(Timestamp(0), e.to_string()))?;
@@ -434,7 +435,13 @@ impl Simulation<'_> {
                 self.lose(lease)?;
                 // In reality the goal under the lease ends before another one begins there.
                 self.busy.given_back(lease).ok();
-                Event::Crashed { instance, attempt, reason: "its lease was lost".to_owned(), unknown: false }
+                Event::Crashed {
+                    instance,
+                    attempt,
+                    reason: "its lease was lost".to_owned(),
+                    unknown: false,
+                    refused: false,
+                }
             }
         };
         if let Event::WorldChanged { facts, .. } = &event {
@@ -681,9 +688,13 @@ impl Simulation<'_> {
                 let evidence = Vec::new();
                 Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason }
             }
-            Answer::Crashed => {
-                Event::Crashed { instance, attempt, reason: "the worker died".to_owned(), unknown: false }
-            }
+            Answer::Crashed => Event::Crashed {
+                instance,
+                attempt,
+                reason: "the worker died".to_owned(),
+                unknown: false,
+                refused: false,
+            },
             Answer::LeaseLost => {
                 let lease = goal.lease.as_ref().map(|lease| lease.id);
                 match lease.filter(|lease| self.leases.get(lease) == Some(&instance)) {
@@ -693,7 +704,13 @@ impl Simulation<'_> {
                         return;
                     }
                     // Inside of a routine only the worker dies.
-                    None => Event::Crashed { instance, attempt, reason: "the worker died".to_owned(), unknown: false },
+                    None => Event::Crashed {
+                        instance,
+                        attempt,
+                        reason: "the worker died".to_owned(),
+                        unknown: false,
+                        refused: false,
+                    },
                 }
             }
         };

@@ -396,7 +396,7 @@ impl System<'_> {
                 self.at(
                     run,
                     Duration::ZERO,
-                    Due::Event(Box::new(Event::Crashed { instance, attempt, reason, unknown: false })),
+                    Due::Event(Box::new(Event::Crashed { instance, attempt, reason, unknown: false, refused: false })),
                 );
             }
             Command::Start { instance, attempt, goal } => {
@@ -409,9 +409,13 @@ impl System<'_> {
                         let (evidence, reason) = Default::default();
                         Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason }
                     }
-                    Answer::Crashed | Answer::LeaseLost => {
-                        Event::Crashed { instance, attempt, reason: "the worker died".to_owned(), unknown: false }
-                    }
+                    Answer::Crashed | Answer::LeaseLost => Event::Crashed {
+                        instance,
+                        attempt,
+                        reason: "the worker died".to_owned(),
+                        unknown: false,
+                        refused: false,
+                    },
                 };
                 self.at(run, Duration::from_secs_f64(duration_s.max(0.0)), Due::Event(Box::new(event)));
             }

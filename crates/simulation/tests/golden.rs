@@ -45,8 +45,9 @@ impl Scenario {
     fn of(folder: PathBuf) -> Scenario {
         let file = folder.join("task.yaml");
         let task = std::fs::read_to_string(&file).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
-        let program = load(&task, &file.display().to_string(), &Beside(&folder));
+        let mut program = load(&task, &file.display().to_string(), &Beside(&folder));
         let script = Script::from_toml(&std::fs::read_to_string(folder.join("script.toml")).unwrap_or_default());
+        program.kinds.clone_from(&script.kinds);
         let wanted = |name: &str| script.modes.is_empty() || script.modes.iter().any(|wanted| wanted == name);
         let modes = [("hsm", Mode::Hsm), ("cdtn", Mode::Cdtn)].into_iter().filter(|(name, _)| wanted(name));
         let run = |(name, mode)| {

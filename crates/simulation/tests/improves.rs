@@ -281,6 +281,7 @@ fn a_routine_that_asks_anew_comes_before_who_only_improves() {
                         attempt,
                         reason: "its worker died".to_owned(),
                         unknown: false,
+                        refused: false,
                     });
                 }
                 Command::Cancel { instance, .. } => stopped.push(paths[&instance].clone()),

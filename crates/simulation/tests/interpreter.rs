@@ -257,7 +257,13 @@ impl Bench {
     /// Its worker died, or nobody knows what became of it.
     fn crash_of(&mut self, instance: u64, attempt: u32, unknown: bool) {
         let (instance, reason) = (InstanceId(instance), "its worker died".to_owned());
-        self.tell(Event::Crashed { instance, attempt, reason, unknown });
+        self.tell(Event::Crashed { instance, attempt, reason, unknown, refused: false });
+    }
+
+    /// Its provider refuses the goal, because its lease is over.
+    fn refuse(&mut self, instance: u64, attempt: u32) {
+        let (instance, reason) = (InstanceId(instance), "its lease is over".to_owned());
+        self.tell(Event::Crashed { instance, attempt, reason, unknown: false, refused: true });
     }
 }
 
@@ -297,6 +303,44 @@ fn a_motion_of_which_nobody_knows_what_became_is_not_tried_again() {
         assert_eq!(is_tried_again, !unknown, "{mode:?} {heard:?}");
         assert_eq!(heard.contains(&"end aborted".to_owned()), unknown, "{mode:?} {heard:?}");
     }
+}
+
+#[test]
+fn a_motion_whose_lease_was_over_when_it_was_to_begin_has_not_been_tried() {
+    for mode in MODES {
+        let mut bench = Bench::new("states: [ go: { MOVE } ]", mode);
+        bench.grant(1, 1);
+        bench.refuse(1, 1);
+        assert_eq!(bench.asks(), 1, "{mode:?}");
+        bench.grant(1, 2);
+        bench.finish(1, 2);
+        assert_eq!(bench.heard().last().map(String::as_str), Some("end success"), "{mode:?}");
+        // Not for ever.
+        let mut bench = Bench::new("states: [ go: { MOVE } ]", mode);
+        for attempt in 1..=3 {
+            bench.grant(1, attempt.into());
+            bench.refuse(1, attempt);
+        }
+        assert_eq!(bench.heard().last().map(String::as_str), Some("end aborted"), "{mode:?}");
+    }
+}
+
+#[test]
+fn a_part_of_a_routine_whose_lease_was_over_when_it_was_to_begin_waits_for_the_new_one() {
+    let mut bench = routine_of("{ states: [ one: { MOVE }, two: { MOVE } ] }", "{ TURN, retry: 1 }");
+    bench.grant(1, 1);
+    assert_eq!(bench.heard(), ["acquire 1", "start 3.1 under 1", "start 4.1 under 1"]);
+    // The lease ends as a whole with this worker.
+    bench.crash(4, 1);
+    bench.finish(3, 1);
+    assert_eq!(bench.heard(), ["start 5.1 under 1"]);
+    bench.refuse(5, 1);
+    assert_eq!(bench.heard(), ["acquire 5", "release 1"]);
+    bench.grant(5, 2);
+    assert_eq!(bench.heard(), ["start 5.2 under 2", "start 4.2 under 2"]);
+    bench.finish(5, 2);
+    bench.finish(4, 2);
+    assert_eq!(bench.heard(), ["release 2", "end success"]);
 }
 
 #[test]

@@ -19,7 +19,10 @@ struct Writer {
     /// What its providers do.
     script: String,
     names: u64,
-    actuator: usize,
+    /// The unit with which motions move; without one there are none.
+    actuator: Option<usize>,
+    /// Whether there are waits, states without an action, and regions inside of regions.
+    waits: bool,
 }
 
 impl Writer {
@@ -46,12 +49,61 @@ impl Writer {
 
     fn motion(&mut self, depth: usize, inputs: &str, effect: &str) {
         let (number, duration) = self.number_and_duration();
-        let [of, unit] = [["arm/move", "Arm"], ["head/turn", "Head"]][self.actuator];
+        let Some(actuator) = self.actuator else { return self.moment(depth) };
+        let [of, unit] = [["arm/move", "Arm"], ["head/turn", "Head"]][actuator];
         let exceptions = if self.below(3) == 0 { "exceptions: imprecise, " } else { "" };
         let what = format!(
             "out: {{ x: any }}, pia: true, {exceptions}reads: [], {inputs}effects: ['{effect}'], resources: [{{ block: {unit} }}]"
         );
         self.line(depth, &format!("- m{number}: {{ action: {of}, {what}, duration: {duration:.7} }}"));
+    }
+
+    /// A wait, or a change of what is shared, in which nothing moves.
+    fn moment(&mut self, depth: usize) {
+        let (number, timeout) = self.number_and_duration();
+        let (fact, limit) = (self.fact(), self.below(3));
+        let what = match self.below(4) {
+            0 => format!("wait: {{ seconds: {} }}", 1 + limit),
+            1 => format!(
+                "wait: {{ for: '{fact} > {limit}', timeout: {timeout:.7} }}, transitions: {{ timeout: success }}"
+            ),
+            2 => format!("states: [], effects: ['{fact} = {limit}']"),
+            _ => format!("states: [], effects: ['increase {fact} by 1']"),
+        };
+        self.line(depth, &format!("- w{number}: {{ {what} }}"));
+    }
+
+    /// States that change something shared when they are left, or with a limit; or regions of which one has the unit, or a race.
+    fn around(&mut self, depth: usize, within: u64) {
+        self.names += 1;
+        let (name, fact, number) = (format!("a{}", self.names), self.fact(), self.below(3));
+        self.line(depth, &format!("- {name}:"));
+        let inside = depth + 2;
+        let kind = self.below(5);
+        if kind < 2 {
+            let effect = if number == 0 { format!("increase {fact} by 1") } else { format!("{fact} = {}", number - 1) };
+            self.line(inside, &format!("effects: ['{effect}']"));
+            self.line(inside, "states:");
+            return self.parts(inside + 1, within - 1, 2);
+        }
+        if kind == 2 {
+            self.line(inside, "timeout: 1000");
+            self.line(inside, "states:");
+            return self.parts(inside + 1, within - 1, 2);
+        }
+        // Of a race nothing moves that could be cut short.
+        let (unit, with, is_race) = (self.actuator, self.below(2), kind == 4);
+        self.line(inside, if is_race { "concurrency: preemptive" } else { "concurrency: barrier" });
+        self.line(inside, "regions:");
+        let with = if is_race { 2 } else { with };
+        for region in 0..2 {
+            self.actuator = unit.filter(|_| region == with);
+            self.line(inside + 1, &format!("- {name}_{region}:"));
+            self.line(inside + 3, SHARED);
+            self.line(inside + 3, "states:");
+            self.parts(inside + 4, within - 1, 2);
+        }
+        self.actuator = unit;
     }
 
     /// A motion that changes what is shared, or says what it has found.
@@ -96,6 +148,13 @@ impl Writer {
     }
 
     fn part(&mut self, depth: usize, within: u64) {
+        if self.waits {
+            match self.below(4) {
+                0 | 1 => return self.moment(depth),
+                2 if within > 0 => return self.around(depth, within),
+                _ => {}
+            }
+        }
         let kind = if within == 0 { 0 } else { self.below(9) };
         if kind < 4 {
             return self.any_motion(depth);
@@ -150,17 +209,21 @@ impl Writer {
     }
 }
 
+/// The facts that the regions share.
+const SHARED: &str = "shared: ['f0()', 'f1()', 'f2()']";
+
 /// A task and its script.
-fn task(seed: u64) -> (String, String) {
+fn task(seed: u64, waits: bool) -> (String, String) {
     let dice = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
-    let mut writer = Writer { dice, text: String::new(), script: "[outcomes]\n".to_owned(), names: 0, actuator: 0 };
+    let (text, script) = (String::new(), "[outcomes]\n".to_owned());
+    let mut writer = Writer { dice, text, script, names: 0, actuator: None, waits };
     writer.line(0, "task: t\nworld: ['f0() = 0', 'f1() = 1', 'f2() = 2']\nstates:\n  - both:");
     writer.line(3, "concurrency: barrier");
     writer.line(3, "regions:");
     for (actuator, region) in ["left", "right"].into_iter().enumerate() {
-        writer.actuator = actuator;
+        writer.actuator = Some(actuator);
         writer.line(4, &format!("- {region}:"));
-        writer.line(6, "shared: ['f0()', 'f1()', 'f2()']");
+        writer.line(6, SHARED);
         writer.line(6, "states:");
         for _ in 0..4 {
             if writer.below(4) == 0 {
@@ -177,12 +240,11 @@ fn task(seed: u64) -> (String, String) {
     (writer.text, writer.script)
 }
 
-#[test]
-fn regions_that_share_facts_end_alike_in_both_modes() {
+fn end_alike(waits: bool, programs: u64) {
     let first: u64 = std::env::var("RATN_FIRST").map_or(0, |first| first.parse().unwrap());
-    let count: u64 = std::env::var("RATN_PROGRAMS").map_or(150, |count| count.parse().unwrap());
+    let count: u64 = std::env::var("RATN_PROGRAMS").map_or(programs, |count| count.parse().unwrap());
     for seed in first..first + count {
-        let (text, script) = task(seed);
+        let (text, script) = task(seed, waits);
         let program = load(&text, "task.yaml", &NoFiles);
         let end = |mode: Mode| {
             let run: Run = Script::from_toml(&script)
@@ -195,4 +257,14 @@ fn regions_that_share_facts_end_alike_in_both_modes() {
         assert_eq!(hsm.0, "success", "{seed}: {}\n{text}", hsm.1);
         assert_eq!(hsm, cdtn, "{seed}\n{text}\n{script}");
     }
+}
+
+#[test]
+fn regions_that_share_facts_end_alike_in_both_modes() {
+    end_alike(false, 150);
+}
+
+#[test]
+fn regions_that_wait_for_each_other_end_alike_in_both_modes() {
+    end_alike(true, 60);
 }

@@ -112,3 +112,102 @@ states:
         assert!(outputs(&executive.handle(Timestamp::from_seconds(2.0), go)).is_some(), "{mode:?}");
     }
 }
+
+/// What is true at the end of an event that comes so many seconds after a task has begun, while nobody looked after it.
+fn late(task: &str, seconds: f64, fact: &str) -> [Option<Value>; 2] {
+    MODES.map(|mode| {
+        let (mut executive, _) = begun(task, mode);
+        executive.handle(Timestamp::from_seconds(seconds), Event::Woken);
+        assert!(executive.has_ended(), "{mode:?}");
+        executive.root().get(&support::fact(fact)).cloned()
+    })
+}
+
+#[test]
+fn what_is_over_when_somebody_looks_again_ends_in_the_order_of_its_times() {
+    let looks = "
+        - looks:
+            shared: ['f()', 'c()']
+            states:
+              - wait_1: { wait: { seconds: 4 } }
+              - is_it:
+                  condition: f() = 1
+                  then: [ yes: { states: [], effects: ['saw() = 1'] } ]
+                  else: [ no: { states: [], effects: ['saw() = 0'] } ]";
+    let alone = "
+        - changes:
+            LIMIT
+            states:
+              - wait_2: { wait: { seconds: 3 } }
+              - change: { states: [], effects: ['f() = 1'] }";
+    let by_another = "
+        - causes:
+            shared: ['c()']
+            states:
+              - wait_2: { wait: { seconds: 3 } }
+              - cause: { states: [], effects: ['c() = 1'] }
+        - changes:
+            LIMIT
+            shared: ['c()']
+            states:
+              - wait_3: { wait: { for: c() = 1 } }
+              - change: { states: [], effects: ['f() = 1'] }";
+    for others in [alone, by_another] {
+        for limit in ["description: plain", "timeout: 100", "routine: true"] {
+            let others = others.replace("LIMIT", limit);
+            let task = format!(
+                "task: t\nworld: ['c() = 0', 'f() = 0']\nstates:\n  - both:\n      concurrency: barrier\n      \
+                 regions:{looks}{others}\n"
+            );
+            assert_eq!(late(&task, 9.0, "saw()"), [1, 1].map(|saw| Some(Value::Int(saw))), "{task}");
+        }
+    }
+}
+
+#[test]
+fn what_was_over_before_the_deadline_is_followed_when_somebody_looks_again() {
+    let task = |seconds: u32| {
+        format!(
+            "task: t\ndeadline: 6\nworld: ['f() = 0']\nstates:\n  - both:\n      concurrency: barrier\n      regions:\n        - \
+             changes: {{ states: [ wait: {{ wait: {{ seconds: {seconds} }} }}, change: {{ states: [], effects: ['f() = 1'] }}, \
+             rest: {{ wait: {{ seconds: 50 }} }} ] }}\n        - other: {{ timeout: 40, states: [ rest_2: {{ wait: {{ seconds: 50 \
+             }} }} ] }}\n"
+        )
+    };
+    assert_eq!(late(&task(3), 9.0, "f()"), [1, 1].map(|f| Some(Value::Int(f))));
+    for not_before in [6, 7] {
+        assert_eq!(late(&task(not_before), 9.0, "f()"), [0, 0].map(|f| Some(Value::Int(f))), "{not_before}");
+    }
+}
+
+#[test]
+fn who_gets_the_next_signal_is_known_before_it_is_sent() {
+    for (left, right) in [(0, 0), (2, 1), (1, 2)] {
+        for limited in ["left", "right", "neither"] {
+            let region = |name: &str, seconds: u32| {
+                let limit = if name == limited { "timeout: 100, " } else { "" };
+                format!(
+                    "        - {name}: {{ {limit}states: [ rest_{name}: {{ wait: {{ seconds: {seconds} }} }}, wait_{name}: {{ \
+                         wait: {{ signal: go }} }} ] }}\n"
+                )
+            };
+            let regions = region("left", left) + &region("right", right);
+            let task = format!("task: t\nstates:\n  - both:\n      concurrency: barrier\n      regions:\n{regions}");
+            for mode in MODES {
+                let (mut executive, mut all) = begun(&task, mode);
+                assert_eq!(executive.first_waiting_for("stop"), None);
+                for second in 1..=2 {
+                    all.extend(executive.handle(Timestamp::from_seconds(f64::from(second)), Event::Woken));
+                }
+                let named = executive.first_waiting_for("go").unwrap();
+                let wanted = if left <= right { "wait_left" } else { "wait_right" };
+                let is_it = |command: &Command| matches!(command, Command::Note(Note::Expanded { instance, path, .. }) if *instance == named && path.ends_with(wanted));
+                assert!(all.iter().any(is_it), "{mode:?} {named} {task}");
+                let go = Event::Signalled { signal: "go".to_owned(), value: Value::Null };
+                let commands = executive.handle(Timestamp::from_seconds(3.0), go);
+                let ends = |command: &Command| matches!(command, Command::Note(Note::Finished { instance, .. }) if *instance == named);
+                assert!(commands.iter().any(ends), "{mode:?} {task}");
+            }
+        }
+    }
+}

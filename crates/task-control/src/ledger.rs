@@ -416,7 +416,10 @@ mod tests {
         ledger.command(&Command::Start { instance, attempt: 2, goal: Box::new(goal()) });
         ledger.command(&Command::Cancel { instance, attempt: 1 });
         assert_eq!(ledger.goals.len(), 1);
-        ledger.event(Timestamp(1), &Event::Crashed { instance, attempt: 2, reason: String::new(), unknown: false });
+        ledger.event(
+            Timestamp(1),
+            &Event::Crashed { instance, attempt: 2, reason: String::new(), unknown: false, refused: false },
+        );
         assert!(ledger.goals.is_empty());
         // The goal may go on if its projection could not be made: a resumption cancels it.
         assert_eq!(ledger.stopped.iter().map(|(_, attempt, _)| *attempt).collect::<Vec<_>>(), [2]);

@@ -417,6 +417,7 @@ impl MakingProjection {
                     attempt,
                     reason: format!("no projection: {}", said(&error)),
                     unknown: false,
+                    refused: false,
                 })
             }
         }

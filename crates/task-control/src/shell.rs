@@ -520,8 +520,8 @@ impl Shell {
                 "{MOST_SIGNALS_KEPT} signals `{signal}` are kept already for states that have yet to wait for them"
             ));
         }
-        let is_it = |awaited: &Awaited| matches!(awaited, Awaited::Signal { signal: name } if *name == signal);
-        let waiting = self.progress.awaiting().find(|(_, awaiting)| is_it(&awaiting.awaited));
+        let first = self.executive.first_waiting_for(&signal);
+        let waiting = self.progress.awaiting().find(|(instance, _)| Some(*instance) == first);
         let said = match waiting {
             Some((_, awaiting)) => format!("{} has waited for it and goes on", awaiting.path),
             None => format!("it is kept for the next state that waits for `{signal}`"),

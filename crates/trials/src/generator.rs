@@ -107,6 +107,7 @@ pub fn program(seed: u64, features: &Features) -> Program {
             .collect(),
         tolerances: Default::default(),
         ontology: None,
+        kinds: Default::default(),
         states: maker.states,
         digest: String::new(),
     };

@@ -201,6 +201,7 @@ impl SystemConfig {
             Some(robot) => absolute(robot, Path::new(""))?,
             None => absolute(&config.robot, folder).with_context(|| name.to_owned())?,
         };
+        config.catalogue.kinds.clone_from(&config.resource_manager.kinds);
         let fitted = config.fit_robot();
         if robot.is_some() {
             fitted.context("--robot")?
@@ -493,6 +494,13 @@ mod tests {
         assert_eq!(parse(&config.to_toml().unwrap(), "again").unwrap(), config);
         assert_eq!(config.catalogue.resources[PATH_PLANNER].count, 4);
         assert_eq!(config.promised_resources()[PATH_PLANNER], 2);
+    }
+
+    #[test]
+    fn tasks_are_checked_with_the_hierarchy_of_kinds_that_the_resource_manager_has() {
+        let config = parse("[resource-manager.kinds]\nSmallPen = [\"Pen\"]\n", "ratn.toml").unwrap();
+        assert_eq!(config.resource_manager.kinds.len(), 1);
+        assert_eq!(config.catalogue.kinds, config.resource_manager.kinds);
     }
 
     #[test]

@@ -319,6 +319,7 @@ fn program(states: Vec<State>, horizon: usize) -> Program {
         initial: Vec::new(),
         tolerances: Default::default(),
         ontology: None,
+        kinds: Default::default(),
         states,
         digest: String::new(),
     }

@@ -44,7 +44,7 @@ use std::fmt::{self, Write};
 use std::sync::Arc;
 
 /// Version of the format. Any change of what is written takes a new number: no version reads another's.
-const FORMAT: u8 = 10;
+const FORMAT: u8 = 12;
 
 type Hash = [u8; blake3::OUT_LEN];
 

@@ -3,46 +3,46 @@
 //! A cancelled or crashed goal changes nothing, because it is not known how far it came.
 
 use super::node::GoalEnd;
-use super::{Current, DEFAULT_ATTEMPTS, Interpreter, Phase, Progress};
+use super::{Current, DEFAULT_ATTEMPTS, Interpreter, MAIN, Phase, Progress};
 use crate::context::Context;
 use crate::plan::NodeNature;
 use crate::protocol::Command;
 use crate::span::span;
-use ratn_model::id::StateId;
+use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, Program, StateKind};
 use ratn_model::resource::ResourceOperation;
+use ratn_model::time::Timestamp;
 
 impl Interpreter {
-    /// Handles what is due: backoffs that are over, and goals that have reached their timeout.
-    pub(super) fn look_at_the_time(&mut self, context: &mut Context<'_>) -> Progress {
-        let all: Vec<u64> = self.threads.keys().copied().collect();
-        for thread in all {
-            let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { continue };
-            let (instance, attempt) = (current.instance, current.attempt);
-            match current.phase {
-                Phase::Backoff(until) if until <= context.now => self.next_try(context, thread),
-                Phase::Running if current.timeout.is_some_and(|at| at <= context.now) => {
-                    if context.program.state(current.state).is_pause() {
-                        // Regions that have ended go on first: a wait that has lost a race takes no signal any more.
-                        let progress = self.advance(context);
-                        if progress != Progress::Busy {
-                            return progress;
-                        }
-                        if self.current(thread).is_some_and(|current| current.instance == instance) {
-                            self.waited_long_enough(context, thread);
-                        }
-                        continue;
-                    }
-                    let limit = context.program.state(current.state).annotations.timeout_s.unwrap_or_default();
-                    context.commands.push(Command::Cancel { instance, attempt });
-                    if !self.is_tried_again(context, thread, false) {
-                        self.end_node(context, thread, format!("it took longer than {limit} s"));
-                    }
-                }
-                _ => {}
-            }
+    /// When the next wait, limit or backoff is over, if it is by now.
+    pub(crate) fn next_due(&self, now: Timestamp) -> Option<Timestamp> {
+        self.timed(MAIN).map(|turn| turn.at).min().filter(|at| *at <= now)
+    }
+
+    /// Ends what is due first, and goes on.
+    pub(crate) fn fall_due(&mut self, context: &mut Context<'_>) -> Progress {
+        if let Some(turn) = self.timed(MAIN).min() {
+            self.time_is_up(context, turn.instance);
         }
-        Progress::Busy
+        self.advance(context)
+    }
+
+    /// The time of a wait is up, a goal has reached its timeout, or a backoff is over.
+    pub(crate) fn time_is_up(&mut self, context: &mut Context<'_>, instance: InstanceId) {
+        let Some(thread) = self.thread_of(instance) else { return };
+        let Some(current) = self.current(thread) else { return };
+        let (attempt, state) = (current.attempt, context.program.state(current.state));
+        match current.phase {
+            Phase::Running if state.is_pause() => self.waited_long_enough(context, thread),
+            Phase::Running => {
+                let limit = state.annotations.timeout_s.unwrap_or_default();
+                context.commands.push(Command::Cancel { instance, attempt });
+                if !self.is_tried_again(context, thread, false) {
+                    self.end_node(context, thread, format!("it took longer than {limit} s"));
+                }
+            }
+            _ => self.next_try(context, thread),
+        }
     }
 
     /// A goal has ended: finishes the node with its result, unless it is tried again.
@@ -83,9 +83,15 @@ impl Interpreter {
         }
     }
 
-    /// An attempt ended without an answer. A computing or sensing node is tried again, up to its limit. Beyond the limit, and for a PIA, it counts as a
-    /// try that ended `aborted`.
-    pub(super) fn crashed(&mut self, context: &mut Context<'_>, thread: u64, reason: &str, unknown: bool) {
+    /// An attempt ended without an answer. A node that computes or senses, or that was refused and so has not begun, is tried again, up to its limit.
+    /// Beyond the limit, and for a PIA, it counts as a try that ended `aborted`.
+    pub(super) fn crashed(
+        &mut self,
+        context: &mut Context<'_>,
+        thread: u64,
+        reason: &str,
+        (unknown, refused): (bool, bool),
+    ) {
         let Some(current) = self.current(thread) else { return };
         let (attempt, id) = (current.attempt, current.state);
         match current.phase {
@@ -101,7 +107,7 @@ impl Interpreter {
         current.crashes += 1;
         let limit = context.program.state(id).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
         let is_irreversible = context.plan.state(id).nature == NodeNature::Irreversible;
-        if is_irreversible || current.crashes >= limit {
+        if is_irreversible && !refused || current.crashes >= limit {
             // A motion that may have been performed is not repeated.
             if is_irreversible && unknown || !self.is_tried_again(context, thread, true) {
                 self.end_node(context, thread, format!("crashed in attempt {attempt}: {reason}"));
@@ -132,7 +138,7 @@ impl Interpreter {
 
     /// A worker of a routine has died: as soon as nothing of the routine uses its old lease, the routine releases it and acquires all of its resources
     /// again.
-    pub(super) fn renew_leases(&mut self, context: &mut Context<'_>) {
+    pub(crate) fn renew_leases(&mut self, context: &mut Context<'_>) {
         let all: Vec<u64> = self.routines.keys().copied().collect();
         for routine in all {
             self.renew_lease(context, routine);

@@ -197,12 +197,12 @@ struct Current {
     units: Vec<String>,
 }
 
-/// The interpreter of one state.
+/// The interpreter of one state. A region's thread has the number of the region's place in the program ([`crate::plan::StatePlan::place`]): no two
+/// threads execute one region at once, and threads go on in the order in which their regions are written.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Interpreter {
     #[serde(with = "checkpoint")]
     threads: BTreeMap<u64, Thread>,
-    last_thread: u64,
     outputs: BTreeMap<StateId, Outputs>,
     /// States of loop bodies whose outputs are still those of the iteration before.
     earlier: BTreeSet<StateId>,
@@ -259,7 +259,6 @@ impl Interpreter {
         };
         Interpreter {
             threads: BTreeMap::from([(MAIN, main)]),
-            last_thread: MAIN,
             outputs,
             earlier: BTreeSet::new(),
             regions: BTreeMap::new(),
@@ -283,17 +282,32 @@ impl Interpreter {
         self.threads.values().flat_map(|thread| &thread.current).any(|current| current.phase == Phase::Acquiring)
     }
 
-    /// Begins with `state`, visited at `path`.
+    /// Begins with `state`, visited at `path`, and goes on.
     pub(crate) fn start(&mut self, context: &mut Context<'_>, state: StateId, path: &str) -> Progress {
-        if let Some(main) = self.threads.get_mut(&MAIN) {
-            main.todo = Todo::Enter(state, Some(path.to_owned()));
-        }
-        self.go_on_with(context)
+        self.begin_with(context, state, path);
+        self.advance(context)
+    }
+
+    /// Begins with `state`, visited at `path`.
+    pub(crate) fn begin_with(&mut self, context: &mut Context<'_>, state: StateId, path: &str) {
+        self.set(MAIN, Todo::Enter(state, Some(path.to_owned())));
+        self.begin_next(context);
     }
 
     /// Whether this instance is under way here.
     pub(crate) fn is_at(&self, instance: InstanceId) -> bool {
-        self.threads.values().flat_map(|thread| &thread.current).any(|current| current.instance == instance)
+        self.thread_of(instance).is_some()
+    }
+
+    /// The thread that an instance is under way in.
+    fn thread_of(&self, instance: InstanceId) -> Option<u64> {
+        let is_at = |thread: &Thread| thread.current.as_ref().is_some_and(|current| current.instance == instance);
+        self.threads.iter().find(|(_, thread)| is_at(thread)).map(|(id, _)| *id)
+    }
+
+    /// Whether what it does is real at once.
+    pub(crate) fn is_actual(&self) -> bool {
+        matches!(self.target, Target::Actual)
     }
 
     /// Whether it has ended because a thread went in circles (too many visits without an action).
@@ -321,6 +335,17 @@ impl Interpreter {
         }
     }
 
+    /// A routine at its place goes on with its own changes of the world as it is now: everything before it is real.
+    pub(crate) fn project_anew(&mut self, root: &World) {
+        if let Target::Projection { base, changes, writers, before, world, .. } = &mut self.target
+            && let Ok(projected) = root.project(&changes[*before..])
+        {
+            changes.drain(..*before);
+            writers.drain(..*before);
+            (*base, *before, *world) = (root.revision(), 0, projected);
+        }
+    }
+
     /// Calls `use_scope` with the scope of the outermost state: its parameters, and the outputs of the executed states.
     pub(crate) fn in_scope<T>(
         &self,
@@ -330,24 +355,40 @@ impl Interpreter {
         self.with_scope(context, MAIN, None, use_scope)
     }
 
-    /// Handles an event for an instance under way, for all of them, or from the operator; ignores the others.
+    /// Handles what is due, then an event.
     pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Progress {
-        // The operator was told that the answer has arrived: a timeout at this very moment does not discard it.
-        if let Event::Answered { instance, choice } = &event {
-            self.answered(context, *instance, choice);
+        let mut progress = self.before(context, &event);
+        while progress == Progress::Busy && self.next_due(context.now).is_some() {
+            progress = self.fall_due(context);
         }
+        if progress == Progress::Busy {
+            self.take(context, event);
+            progress = self.advance(context);
+        }
+        if progress == Progress::Busy {
+            self.renew_leases(context);
+        }
+        progress
+    }
+
+    /// What comes before everything that is due: an answer, because the operator was told that it has arrived.
+    pub(crate) fn before(&mut self, context: &mut Context<'_>, event: &Event) -> Progress {
         self.has_changed = true;
-        let progress = self.look_at_the_time(context);
-        if progress != Progress::Busy {
-            return progress;
-        }
+        let Event::Answered { instance, choice } = event else { return Progress::Busy };
+        self.answered(context, *instance, choice);
+        self.advance(context)
+    }
+
+    /// Takes an event for an instance under way, for all of them, or from the operator; ignores the others. What follows from it is left to do.
+    pub(crate) fn take(&mut self, context: &mut Context<'_>, event: Event) {
+        self.has_changed = true;
         let of = |interpreter: &Interpreter, id: InstanceId, attempt: Option<u32>| {
-            let at = |thread: &Thread| {
-                thread.current.as_ref().is_some_and(|c| c.instance == id && attempt.is_none_or(|a| a == c.attempt))
-            };
-            interpreter.threads.iter().find(|(_, thread)| at(thread)).map(|(thread, _)| *thread)
+            let is_at = |current: &Current| attempt.is_none_or(|attempt| attempt == current.attempt);
+            let is_meant = |thread: &u64| interpreter.threads[thread].current.as_ref().is_some_and(is_at);
+            interpreter.thread_of(id).filter(is_meant)
         };
         match event {
+            Event::Answered { instance, choice } => self.answered(context, instance, &choice),
             Event::Granted { instance, lease } => {
                 if let Some(thread) = of(self, instance, None) {
                     self.granted(context, thread, lease);
@@ -368,9 +409,9 @@ impl Interpreter {
                     self.run(context, thread);
                 }
             }
-            Event::Crashed { instance, attempt, reason, unknown } => {
+            Event::Crashed { instance, attempt, reason, unknown, refused } => {
                 if let Some(thread) = of(self, instance, Some(attempt)) {
-                    self.crashed(context, thread, &reason, unknown);
+                    self.crashed(context, thread, &reason, (unknown, refused));
                 }
             }
             Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason } => {
@@ -396,11 +437,6 @@ impl Interpreter {
             }
             _ => {}
         }
-        let progress = self.go_on_with(context);
-        if progress == Progress::Busy {
-            self.renew_leases(context);
-        }
-        progress
     }
 
     pub(crate) fn break_at(&mut self, program: &Program, breakpoints: Vec<String>) {

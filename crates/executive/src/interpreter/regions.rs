@@ -2,6 +2,7 @@
 
 use super::{Decided, Interpreter, Thread, Todo};
 use crate::context::Context;
+use crate::plan::Plan;
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, StateKind, VIOLATED};
 use ratn_model::wait::Wait;
@@ -9,13 +10,13 @@ use std::sync::Arc;
 
 impl Interpreter {
     /// Begins every region, each with its own copy of the variables.
-    pub(super) fn fork(&mut self, thread: u64, state: StateId, path: String, regions: &[StateId]) {
+    pub(super) fn fork(&mut self, plan: &Plan, thread: u64, state: StateId, path: String, regions: &[StateId]) {
         let Some(around) = self.threads.get(&thread) else { return };
         let (variables, routine) = (around.variables.clone(), around.routine);
         let mut threads = Vec::new();
         for region in regions {
-            self.last_thread += 1;
-            threads.push(self.last_thread);
+            let number = plan.state(*region).place;
+            threads.push(number);
             let todo = Todo::Enter(*region, None);
             let frame = super::Frame {
                 owner: state,
@@ -28,7 +29,7 @@ impl Interpreter {
             };
             let (frames, variables) = (vec![frame], variables.clone());
             let region = Thread { frames, variables, todo, current: None, routine, idle_visits: 0, cut_short: None };
-            self.threads.insert(self.last_thread, region);
+            self.threads.insert(number, region);
         }
         self.set(thread, Todo::Join { state, path, regions: threads, decided: None });
     }

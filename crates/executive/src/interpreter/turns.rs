@@ -26,7 +26,7 @@ impl Interpreter {
     }
 
     /// Begins the queued goals whose turn it is; true if any began.
-    pub(super) fn take_turns(&mut self, context: &mut Context<'_>) -> bool {
+    pub(crate) fn take_turns(&mut self, context: &mut Context<'_>) -> bool {
         let is_queued = |thread: &u64| matches!(self.phase(*thread), Some(Phase::Queued(_)));
         let queued = self.threads.keys().copied().filter(is_queued);
         let mut has_begun = false;

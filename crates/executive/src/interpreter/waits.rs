@@ -1,27 +1,18 @@
 //! States that wait: they begin as actions do, but no provider gets a goal. Whenever the world may have changed or a signal may have come,
-//! every wait under way is checked.
+//! every wait under way is checked, in its turn.
 
 use super::node::GoalEnd;
-use super::{Interpreter, Phase, Progress, Thread};
+use super::{Current, Interpreter, MAIN, Phase};
 use crate::awaiting::{self, WaitEnd};
 use crate::binding;
 use crate::context::Context;
 use crate::protocol::{Awaited, Command, Note};
+use crate::turn::Turn;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{Program, VIOLATED};
 use ratn_model::time::Timestamp;
 
 impl Interpreter {
-    /// Goes on until all threads wait and none of these waits is over.
-    pub(super) fn go_on_with(&mut self, context: &mut Context<'_>) -> Progress {
-        loop {
-            let progress = self.advance(context);
-            if progress != Progress::Busy || !self.look_at_waits(context) {
-                return progress;
-            }
-        }
-    }
-
     pub(super) fn begin_waiting(&mut self, context: &mut Context<'_>, thread: u64) {
         let program = context.program;
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
@@ -56,32 +47,55 @@ impl Interpreter {
         }
     }
 
-    /// Since when the wait that is under way for the longest time waits.
-    pub(crate) fn waits_since(&self, program: &Program) -> Option<Timestamp> {
-        let under_way = self.threads.values().filter_map(|thread| thread.current.as_ref());
-        let waits =
-            under_way.filter(|current| current.phase == Phase::Running && program.state(current.state).is_pause());
-        waits.map(|current| current.since).min()
+    /// The turns of the waits and watched motions under way. `place` is that of the region around the state.
+    pub(crate) fn waits<'a>(&'a self, program: &'a Program, place: u64) -> impl Iterator<Item = Turn> + 'a {
+        let waits = |current: &Current| {
+            let state = program.state(current.state);
+            current.phase == Phase::Running && (state.is_pause() || !state.annotations.holds.is_empty())
+        };
+        self.turns(place, move |current| waits(current).then_some(current.since))
     }
 
-    /// Checks waits and watched motions under way until one is over; true if one was. What has waited longest comes first, then the first
-    /// thread. The consequences are handled before the others are checked.
-    pub(super) fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
-        let waits = |(thread, current): (u64, &super::Current)| {
-            let state = context.program.state(current.state);
-            let may_end = state.is_pause() || !state.annotations.holds.is_empty();
-            (current.phase == Phase::Running && may_end).then_some((current.since, thread, current.state))
-        };
-        let under_way = self.threads.iter().filter_map(|(id, thread)| Some((*id, thread.current.as_ref()?)));
-        let mut waiting: Vec<(Timestamp, u64, StateId)> = under_way.filter_map(waits).collect();
-        waiting.sort_unstable();
-        waiting.into_iter().any(|(_, thread, state)| {
-            if context.program.state(state).is_pause() {
-                self.ends_waiting(context, thread, state)
-            } else {
-                self.ends_violated(context, thread)
-            }
+    /// The turns of what ends by its time.
+    pub(crate) fn timed(&self, place: u64) -> impl Iterator<Item = Turn> {
+        self.turns(place, |current| match current.phase {
+            Phase::Backoff(until) => Some(until),
+            Phase::Running => current.timeout,
+            _ => None,
         })
+    }
+
+    fn turns<'a>(
+        &'a self,
+        place: u64,
+        at: impl Fn(&Current) -> Option<Timestamp> + 'a,
+    ) -> impl Iterator<Item = Turn> + 'a {
+        self.threads.iter().filter_map(move |(thread, of)| {
+            let current = of.current.as_ref()?;
+            let place = if *thread == MAIN { place } else { *thread };
+            Some(Turn { at: at(current)?, place, instance: current.instance, state: current.state })
+        })
+    }
+
+    /// Ends the first wait that is over, if the world may have ended one since the last look; true if one was.
+    pub(super) fn end_a_wait(&mut self, context: &mut Context<'_>) -> bool {
+        if std::mem::take(&mut self.has_changed) {
+            let mut waiting: Vec<Turn> = self.waits(context.program, MAIN).collect();
+            waiting.sort_unstable();
+            self.has_changed = waiting.into_iter().any(|turn| self.is_over(context, turn.instance));
+        }
+        self.has_changed
+    }
+
+    /// Ends a wait, or a watched motion, if it is over; true if it was.
+    pub(crate) fn is_over(&mut self, context: &mut Context<'_>, instance: InstanceId) -> bool {
+        match self.thread_of(instance).and_then(|thread| Some((thread, self.current(thread)?.state))) {
+            Some((thread, state)) if context.program.state(state).is_pause() => {
+                self.ends_waiting(context, thread, state)
+            }
+            Some((thread, _)) => self.ends_violated(context, thread),
+            None => false,
+        }
     }
 
     /// Ends a wait if its condition holds or its signal is kept; true if it ended.
@@ -132,11 +146,9 @@ impl Interpreter {
 
     /// An operator has answered a question.
     pub(super) fn answered(&mut self, context: &mut Context<'_>, instance: InstanceId, choice: &str) {
-        let asks = |thread: &Thread| {
-            let current = thread.current.as_ref();
-            current.is_some_and(|current| current.instance == instance && current.phase == Phase::Running)
+        let Some(thread) = self.thread_of(instance).filter(|id| self.phase(*id) == Some(Phase::Running)) else {
+            return;
         };
-        let Some(thread) = self.threads.iter().find(|(_, thread)| asks(thread)).map(|(id, _)| *id) else { return };
         let Some(id) = self.current(thread).map(|current| current.state) else { return };
         if let Some(end) = awaiting::answered(context.program.state(id), choice) {
             self.has_waited(context, thread, end);

@@ -12,43 +12,65 @@ use std::sync::Arc;
 
 impl Interpreter {
     /// Lets every thread go on until all wait for events or the state has ended. Ends are followed first, up to the next state that would begin;
-    /// then waits are checked, because an end may have changed what they wait for; only then do states begin.
-    pub(super) fn advance(&mut self, context: &mut Context<'_>) -> Progress {
+    /// then a wait that is over ends, because an end may have changed what it waits for; only then does a state begin.
+    pub(crate) fn advance(&mut self, context: &mut Context<'_>) -> Progress {
         loop {
-            let follows = |thread: u64, todo: &Todo| match todo {
-                Todo::Ended { .. } | Todo::Iterate => true,
-                Todo::Enter(..) | Todo::Busy => false,
-                Todo::Join { state, regions, decided, .. } => {
-                    self.may_join(context.program, thread, *state, regions, decided.is_some())
-                }
-                Todo::Done { .. } => thread == MAIN,
-            };
-            let id = match (self.first(follows), self.first(|_, todo| matches!(todo, Todo::Enter(..)))) {
-                (Some(id), _) => id,
-                (None, None) if self.take_turns(context) => continue,
-                (None, None) => return Progress::Busy,
-                (None, Some(_)) if std::mem::take(&mut self.has_changed) && self.look_at_waits(context) => {
-                    self.has_changed = true;
-                    continue;
-                }
-                (None, Some(id)) => id,
-            };
-            let Some(thread) = self.threads.get_mut(&id) else { return Progress::Busy };
-            match std::mem::replace(&mut thread.todo, Todo::Busy) {
-                Todo::Enter(state, path) => self.enter(context, id, state, path),
-                Todo::Ended { state, outcome, reason } => self.follow(context, id, state, outcome, reason),
-                Todo::Iterate => self.iterate(context, id),
-                Todo::Busy => {}
-                Todo::Join { state, path, regions, decided } => {
-                    self.join(context, id, state, path, regions, decided);
-                }
-                Todo::Done { outcome, reason } => return Progress::Ended { outcome, reason },
-            }
-            if let Some(reason) = self.in_circles.clone() {
-                self.abort(context);
-                return Progress::Ended { outcome: ABORTED.to_owned(), reason };
+            let progress = self.progress(context);
+            let goes_on = progress == Progress::Busy
+                && (self.follow_end(context)
+                    || self.end_a_wait(context)
+                    || self.begin_next(context)
+                    || self.take_turns(context));
+            if !goes_on {
+                return progress;
             }
         }
+    }
+
+    /// Whether the state has ended.
+    pub(crate) fn progress(&mut self, context: &mut Context<'_>) -> Progress {
+        if let Some(reason) = self.in_circles.clone() {
+            self.abort(context);
+            return Progress::Ended { outcome: ABORTED.to_owned(), reason };
+        }
+        match self.threads.get(&MAIN).map(|main| &main.todo) {
+            Some(Todo::Done { outcome, reason }) => {
+                Progress::Ended { outcome: outcome.clone(), reason: reason.clone() }
+            }
+            _ => Progress::Busy,
+        }
+    }
+
+    /// Follows the first end, one step; false if there is none.
+    pub(crate) fn follow_end(&mut self, context: &mut Context<'_>) -> bool {
+        let follows = |thread: u64, todo: &Todo| match todo {
+            Todo::Ended { .. } | Todo::Iterate => true,
+            Todo::Enter(..) | Todo::Busy | Todo::Done { .. } => false,
+            Todo::Join { state, regions, decided, .. } => {
+                self.may_join(context.program, thread, *state, regions, decided.is_some())
+            }
+        };
+        let first = self.first(follows);
+        self.goes_on(context, first)
+    }
+
+    /// The first thread that can begins its next state; false if there is none.
+    pub(crate) fn begin_next(&mut self, context: &mut Context<'_>) -> bool {
+        let first = self.first(|_, todo| matches!(todo, Todo::Enter(..)));
+        self.goes_on(context, first)
+    }
+
+    fn goes_on(&mut self, context: &mut Context<'_>, thread: Option<u64>) -> bool {
+        let Some(id) = thread.filter(|_| self.in_circles.is_none()) else { return false };
+        let Some(thread) = self.threads.get_mut(&id) else { return false };
+        match std::mem::replace(&mut thread.todo, Todo::Busy) {
+            Todo::Enter(state, path) => self.enter(context, id, state, path),
+            Todo::Ended { state, outcome, reason } => self.follow(context, id, state, outcome, reason),
+            Todo::Iterate => self.iterate(context, id),
+            Todo::Join { state, path, regions, decided } => self.join(context, id, state, path, regions, decided),
+            Todo::Busy | Todo::Done { .. } => {}
+        }
+        true
     }
 
     /// The first thread whose next step satisfies `is_such`.
@@ -167,7 +189,7 @@ impl Interpreter {
                     Err(error) => self.ended(thread, id, ABORTED, wrong("its predicate", &error)),
                 }
             }
-            StateKind::Concurrency { regions, .. } => self.fork(thread, id, path, regions),
+            StateKind::Concurrency { regions, .. } => self.fork(context.plan, thread, id, path, regions),
         }
     }
 

@@ -56,6 +56,8 @@ pub(crate) struct Plan {
 /// The plan of one state.
 #[derive(Debug)]
 pub(crate) struct StatePlan {
+    /// Its place in the order in which the states are written: 0 for the root. A state stands before what it contains.
+    pub(crate) place: u64,
     /// Its effect on the environment, including everything inside of it.
     pub(crate) nature: NodeNature,
     /// An action or a routine: executed as one node.
@@ -68,8 +70,6 @@ pub(crate) struct StatePlan {
     pub(crate) imprecise: bool,
     /// It waits, or something that it contains does.
     pub(crate) waits: bool,
-    /// A change of the world may end it or a part of it: a wait, or a watched motion.
-    pub(crate) is_watched: bool,
     /// Of an action: the name of its provider and its own name.
     pub(crate) action: Option<(Arc<str>, Arc<str>)>,
 
@@ -154,6 +154,13 @@ impl Plan {
         let states: Vec<StatePlan> = program.states.iter().map(of).collect();
         let (width, buckets) = (names.numbers.len() + 2, Plan::buckets(program.horizon));
         let mut plan = Plan { states, crossing, width, buckets, names };
+        let mut open = vec![Program::ROOT];
+        for place in 0.. {
+            let Some(id) = open.pop() else { break };
+            plan.states[index(id)].place = place;
+            let inside: Vec<StateId> = program.state(id).children().collect();
+            open.extend(inside.into_iter().rev());
+        }
         for (id, kept) in improves::of(program, &plan) {
             plan.states[index(id)].improves = Some(kept);
         }
@@ -223,6 +230,7 @@ impl StatePlan {
         let around = around.map(|around| &around.kind);
         let exceptions = state.annotations.exceptions.unwrap_or(program.exceptions);
         StatePlan {
+            place: 0,
             nature,
             is_node: subject.is_node,
             is_routine: subject.is_routine(),
@@ -232,7 +240,6 @@ impl StatePlan {
                 && !is_watched
                 && !is_before_finally,
             waits,
-            is_watched,
             action: match &state.kind {
                 StateKind::Action { provider, action, .. } => Some((Arc::from(&**provider), Arc::from(&**action))),
                 _ => None,
@@ -336,9 +343,10 @@ impl Names {
         next
     }
 
-    /// The number of the task resources of a kind, under a name that no predicate can have.
-    fn of_kind(&mut self, kind: &str) -> Predicate {
-        self.of_predicate(&format!("#{kind}"))
+    /// The number of the task resources of a kind and of all related kinds, under a name that no predicate can have.
+    fn of_kind(&mut self, program: &Program, kind: &str) -> Predicate {
+        let family = program.family(kind);
+        self.of_predicate(&format!("#{}", family.first().unwrap_or(&kind)))
     }
 }
 

@@ -22,6 +22,7 @@ pub(super) fn of(
     crossing: &Footprint,
     names: &mut Names,
 ) -> Resources {
+    let program = subject.program;
     let requirements = requirements(subject, crossing);
     let operations = operations(subject.state);
     let operated: BTreeSet<&str> = if subject.is_node {
@@ -33,10 +34,12 @@ pub(super) fn of(
         operated_anywhere.contains(r.kind.as_str()) && r.class.is_none_or(|class| class == ResourceClass::Task)
     };
     let used = requirements.iter().filter(of_the_task).map(|r| r.kind.as_str());
-    let numbers: Vec<Predicate> = operated.iter().map(|kind| names.of_kind(kind)).collect();
-    let kinds: BTreeSet<Predicate> = used.map(|kind| names.of_kind(kind)).chain(numbers.iter().copied()).collect();
+    let operated: BTreeSet<Predicate> = operated.into_iter().map(|kind| names.of_kind(program, kind)).collect();
+    let used = used.map(|kind| names.of_kind(program, kind));
+    let kinds = used.chain(operated.iter().copied()).collect::<BTreeSet<Predicate>>().into_iter().collect();
     let works_with = works_with(subject);
-    Resources { kinds: kinds.into_iter().collect(), operated: numbers, requirements, works_with, operations }
+    let operated = operated.into_iter().collect();
+    Resources { kinds, operated, requirements, works_with, operations }
 }
 
 /// What an action blocks itself, else what the innermost state around it that blocks anything blocks. World models are left out: many goals may
@@ -63,9 +66,9 @@ pub(super) fn operated(state: &State) -> impl Iterator<Item = &str> {
     state.annotations.resources.iter().filter(changes).map(|r| r.kind.as_str())
 }
 
-/// The kinds of resources that any state creates, deletes or consumes.
+/// The kinds of resources that any state creates, deletes or consumes, with all related kinds.
 pub(super) fn operated_anywhere(program: &Program) -> BTreeSet<&str> {
-    program.states.iter().flat_map(operated).collect()
+    program.states.iter().flat_map(operated).flat_map(|kind| program.family(kind)).collect()
 }
 
 /// Whether a state is in a routine that works on the actual world: a computing node there runs at its place in the program and reads the root.

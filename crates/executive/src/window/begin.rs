@@ -487,13 +487,10 @@ impl Window {
         };
         let lease = self.graph.take_held(id).lease.map(|lease| *lease);
         let routine = Routine { requirements, lease, visit: None };
-        let mut interpreter = Box::new(Interpreter::of_routine(variables, outputs, routine, target));
+        let interpreter = Box::new(Interpreter::of_routine(variables, outputs, routine, target));
         let path = self.path(context.program, id);
-        let before = context.commands.len();
-        let progress = interpreter.start(context, state, &path);
         self.graph.run_routine(id, interpreter);
-        self.note_crossings_of_routine(context, id, before);
-        self.routine_progressed(context, id, progress);
+        self.with_routine(context, id, |routine, context| routine.begin_with(context, state, &path));
     }
 
     /// Instances that wait for the resource manager ask again if their priority has changed.

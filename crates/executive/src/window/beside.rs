@@ -72,17 +72,12 @@ impl Window {
             let Some(instance) = self.graph.get(*id) else { continue };
             let seen = |fact: &&FactPattern| instance.seen().is_some_and(|seen| seen.overlaps(fact));
             let Some(fact) = facts.iter().find(seen) else { continue };
-            if !self.is_at_its_place(instance) && !self.sees_the_same(context, instance) {
+            if !self.sees_the_same(context, instance) && !self.goes_on(context, *id) {
                 self.came_otherwise(context, *id, false, format!("another region has changed {fact}"));
             }
         }
         self.revise(context);
         self.decide_again(context, elsewhere, &Footprint::Patterns(facts));
-    }
-
-    /// Whether the sequential program would also be at it: everything before it in its region has ended.
-    fn is_at_its_place(&self, instance: &Instance) -> bool {
-        instance.is_head && instance.is_under_way() && self.older_beside(instance).is_none()
     }
 
     /// The older imprecise PIA that an instance must wait for, because the instance is in a region and uses shared facts. While that PIA runs,

@@ -7,7 +7,7 @@ use super::waits::{Timer, Wait};
 use crate::binding;
 use crate::context::{Context, Made};
 use crate::effects;
-use crate::interpreter::{DEFAULT_ATTEMPTS, Progress};
+use crate::interpreter::{DEFAULT_ATTEMPTS, Interpreter, Progress};
 use crate::plan::gives_outputs;
 use crate::protocol::{Command, Event, Note};
 use crate::span::span;
@@ -38,60 +38,17 @@ impl Window {
                 self.goal_ended(context, id, answer);
             }
             (
-                Event::Crashed { reason, unknown, .. },
+                Event::Crashed { reason, unknown, refused, .. },
                 Some(Status::Acquiring { .. } | Status::Granted(_) | Status::Projecting(_) | Status::Running(_)),
             ) => {
-                self.crashed(context, id, &reason, unknown);
+                self.crashed(context, id, &reason, (unknown, refused));
             }
             (event, _) => self.in_routine(context, event),
         }
     }
 
-    /// Handles the timers that are due.
-    pub(super) fn fire(&mut self, context: &mut Context<'_>) {
-        while self.end.is_none()
-            && let Some(timer) = self.waits.next_due(&self.graph, context.now)
-        {
-            match timer {
-                Timer::Retry(id) => self.waits.enqueue(&mut self.graph, id),
-                Timer::Hold(id) => {
-                    if self.dispatch.let_go(id, context.now) {
-                        self.waits.enqueue(&mut self.graph, id);
-                    }
-                }
-                Timer::Room(id) => self.make_way_for(context, id),
-                Timer::Timeout(id, attempt) => {
-                    if !self.is_at(id, attempt) {
-                        continue;
-                    }
-                    let Some(instance) = self.graph.get(id) else { continue };
-                    if context.program.state(instance.state).is_pause() {
-                        // What follows the end of another wait comes first.
-                        self.end = self.go_on(context);
-                        if self.end.is_none() && self.is_at(id, attempt) {
-                            self.waited_long_enough(context, id);
-                        }
-                        continue;
-                    }
-                    let limit = context.program.state(instance.state).annotations.timeout_s.unwrap_or_default();
-                    context.commands.push(Command::Cancel { instance: id, attempt });
-                    self.goal_ended(context, id, Ended::aborted(format!("it took longer than {limit} s")));
-                }
-                Timer::Deadline => {
-                    let limit = context.program.deadline_s.unwrap_or_default();
-                    self.cut_short(context, ABORTED, format!("the task took longer than its deadline of {limit} s"));
-                }
-            }
-        }
-    }
-
-    /// Whether this attempt of an instance is running.
-    fn is_at(&self, id: InstanceId, attempt: u32) -> bool {
-        self.graph.node(id).is_some_and(|node| node.attempt == attempt && node.status.is_running())
-    }
-
     /// A goal has ended: finishes the node with its result, unless it is tried again.
-    fn goal_ended(&mut self, context: &mut Context<'_>, id: InstanceId, ended: Ended) {
+    pub(super) fn goal_ended(&mut self, context: &mut Context<'_>, id: InstanceId, ended: Ended) {
         let Some(instance) = self.graph.get(id) else { return };
         let tries = instance.node().map_or(1, |node| node.tries);
         let retry = context.program.state(instance.state).annotations.retry;
@@ -198,16 +155,18 @@ impl Window {
     }
 
     /// An attempt has ended without an answer.
-    fn crashed(&mut self, context: &mut Context<'_>, id: InstanceId, reason: &str, unknown: bool) {
+    fn crashed(&mut self, context: &mut Context<'_>, id: InstanceId, reason: &str, (unknown, refused): (bool, bool)) {
         let Some(instance) = self.graph.get(id) else { return };
         let Some(node) = instance.node() else { return };
         let limit = context.program.state(instance.state).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
-        let (is_pia, attempt) = (instance.is_pia(), node.attempt);
+        let (is_pia, is_detached, attempt) = (instance.is_pia(), instance.is_detached(), node.attempt);
         let is_held = is_pia && matches!(node.status, Status::Granted(_));
         // A node that had not begun only loses what it held, and asks again when it may.
         if !is_held {
             let crashes = self.graph.count_crash(id);
-            if is_pia || crashes >= limit {
+            // A motion beside which younger ones go on keeps its place: it counts as tried.
+            let has_not_begun = refused && !is_detached;
+            if is_pia && !has_not_begun || crashes >= limit {
                 let ended = Ended::aborted(format!("crashed in attempt {attempt}: {reason}"));
                 // A motion that may have been performed is not repeated.
                 return if is_pia && unknown {
@@ -313,38 +272,52 @@ impl Window {
         });
         drop(active);
         if let Some(routine) = routine {
-            self.tell_routine(context, routine, event);
+            self.with_routine(context, routine, |interpreter, context| interpreter.take(context, event));
         }
     }
 
-    pub(super) fn status_of_routine(&self, id: InstanceId) -> Option<&crate::interpreter::Interpreter> {
+    pub(super) fn status_of_routine(&self, id: InstanceId) -> Option<&Interpreter> {
         match &self.graph.node(id)?.status {
             Status::RunningRoutine(interpreter, _) => Some(interpreter),
             _ => None,
         }
     }
 
-    /// Lets the nodes inside of routines handle timers that are due.
-    pub(super) fn wake_routines(&mut self, context: &mut Context<'_>) {
-        let routines: Vec<InstanceId> =
-            self.dispatch.active().filter(|id| self.status_of_routine(*id).is_some()).collect();
-        for routine in routines {
-            self.tell_routine(context, routine, Event::Woken);
-        }
+    /// Whether a routine goes on in the turn of its line, because what it does is real at once. Others go on by themselves.
+    pub(super) fn goes_on_in_turn(&self, id: InstanceId) -> bool {
+        let is_head = self.graph.get(id).is_some_and(|instance| instance.is_head);
+        is_head && self.status_of_routine(id).is_some_and(Interpreter::is_actual)
     }
 
-    pub(super) fn tell_routine(&mut self, context: &mut Context<'_>, id: InstanceId, event: Event) {
-        let Some(interpreter) = self.graph.interpreter(id) else { return };
+    /// Lets something happen inside of a routine under way; handles what comes of it.
+    pub(super) fn with_routine<T>(
+        &mut self,
+        context: &mut Context<'_>,
+        id: InstanceId,
+        happens: impl FnOnce(&mut Interpreter, &mut Context<'_>) -> T,
+    ) -> Option<T> {
+        let in_turn = self.goes_on_in_turn(id);
+        let interpreter = self.graph.interpreter(id)?;
         let has_asked = interpreter.asks();
         let before = context.commands.len();
-        let progress = interpreter.handle(context, event);
+        let happened = happens(interpreter, context);
+        if !in_turn && interpreter.advance(context) == Progress::Busy {
+            interpreter.renew_leases(context);
+        }
+        let progress = interpreter.progress(context);
         let asks = interpreter.asks() && !has_asked;
+        for command in &context.commands[before..] {
+            if let Command::Wake { at } = command {
+                self.waits.set_timer_at(*at, Timer::Inside(id));
+            }
+        }
         self.note_crossings_of_routine(context, id, before);
         self.routine_progressed(context, id, progress);
         if asks && let Some(instance) = self.graph.get(id) {
             self.dispatch.asks_again(&self.graph, instance);
             self.make_room(context, id);
         }
+        Some(happened)
     }
 
     pub(super) fn routine_progressed(&mut self, context: &mut Context<'_>, id: InstanceId, progress: Progress) {

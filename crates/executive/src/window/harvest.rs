@@ -141,7 +141,7 @@ impl Window {
         let kinds: BTreeSet<String> = context.commands.iter().flat_map(removed).map(|one| one.kind.clone()).collect();
         let holds = |improvement: &Improvement| {
             let held = &context.plan.state(improvement.state).requirements;
-            held.iter().any(|held| kinds.contains(&held.kind))
+            held.iter().any(|held| kinds.iter().any(|kind| context.program.may_be_one(kind, &held.kind)))
         };
         let holders = self.improving.iter().filter(|(_, improvement)| holds(improvement));
         let holders: Vec<InstanceId> = holders.map(|(id, _)| id).collect();
@@ -196,7 +196,9 @@ impl Window {
         id: InstanceId,
     ) -> impl Iterator<Item = InstanceId> + 'a {
         let wanted = self.graph.get(id).map(|instance| &context.plan.state(instance.state).requirements);
-        let is_wanted = move |kind: &str| wanted.is_some_and(|wanted| wanted.iter().any(|wanted| wanted.kind == kind));
+        let is_wanted = move |kind: &str| {
+            wanted.is_some_and(|wanted| wanted.iter().any(|wanted| context.program.may_be_one(&wanted.kind, kind)))
+        };
         let holds = move |improvement: &Improvement| {
             context.plan.state(improvement.state).requirements.iter().any(|held| is_wanted(&held.kind))
         };

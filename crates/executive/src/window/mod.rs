@@ -18,6 +18,7 @@
 //! | `ready`, `begin` | a node may begin, asks for its resources, gets its projection, runs |
 //! | `place` | a computing or sensing node that runs ahead comes to its place in the sequential program |
 //! | `waiting` | a state waits, without a provider |
+//! | `due` | a wait, a limit or a pause before the next try is over |
 //! | `finish` | a goal ends, a worker dies, a node is tried again |
 //! | `harvest` | an anytime result is improved until it is used or its resources are wanted |
 //! | `decide` | conditions, lists of loops, deciders, ends of composite states |
@@ -37,6 +38,7 @@ mod checkpoint;
 mod decide;
 mod discard;
 mod dispatch;
+mod due;
 mod finish;
 mod graph;
 mod growth;
@@ -153,22 +155,32 @@ impl Window {
 
     /// Begins the run.
     pub(crate) fn start(&mut self, context: &mut Context<'_>) -> Option<End> {
-        if let Some(deadline_s) = context.program.deadline_s {
-            self.set_timer(context, deadline_s, Timer::Deadline);
-        }
         self.go_on(context)
     }
 
-    /// Handles due timers before an event; returns the end of the run if a timer ended it, because the event then comes after the
-    /// end.
+    /// What comes before everything that is due: an answer, because the operator was told that it has arrived, and what the root and the signals
+    /// already contain. Returns the end of the run if the answer ended it.
     pub(crate) fn before(&mut self, context: &mut Context<'_>, event: &Event) -> Option<End> {
         self.followed = 0;
         self.assigned_again.clear();
-        // The operator was told that the answer has arrived: a timeout at this very moment does not discard it.
-        if let Event::Answered { instance, choice } = event {
-            self.answer(context, *instance, choice);
+        match event {
+            Event::Answered { instance, choice } => {
+                self.answer(context, *instance, choice);
+                return self.go_on(context);
+            }
+            Event::WorldChanged { facts, .. } => {
+                self.may_end_waits = true;
+                self.world_changed(context, facts.iter().map(|(fact, _)| fact));
+            }
+            Event::Signalled { .. } => self.may_end_waits = true,
+            _ => {}
         }
-        self.fire(context);
+        None
+    }
+
+    /// The run has reached its deadline; returns its end.
+    pub(crate) fn end_early(&mut self, context: &mut Context<'_>, reason: String) -> Option<End> {
+        self.cut_short(context, ABORTED, reason);
         self.end.take()
     }
 
@@ -201,14 +213,11 @@ impl Window {
                 self.hold_back(context, &held);
                 self.ask_again(context);
             }
-            Event::WorldChanged { facts, .. } => {
-                self.may_end_waits = true;
-                self.world_changed(context, facts.iter().map(|(fact, _)| fact));
-            }
             Event::WantedByOthers { holders } => self.give_way_to_others(context, &holders),
-            Event::Signalled { .. } => self.may_end_waits = true,
-            Event::Woken => self.wake_routines(context),
             Event::Answered { .. }
+            | Event::WorldChanged { .. }
+            | Event::Signalled { .. }
+            | Event::Woken
             | Event::Started { .. }
             | Event::Progressed { .. }
             | Event::Recorded { .. }

@@ -1,6 +1,6 @@
 //! Changes of the world from outside the run: a fact has expired, or another client has written one.
 //!
-//! Retired results stay, and so does a motion under way, as in HSM mode. Everything else that depends on a changed fact is made
+//! Retired results stay, and what is under way at its place goes on, as in HSM mode. Everything else that depends on a changed fact is made
 //! again, settled or not. A decision that would now be different is made again in place, and what was expanded behind it is
 //! discarded. Nothing behind it has begun that could not be discarded, because no PIA begins before its decisions have retired. Such
 //! changes are rare, so examining the whole window is acceptable.
@@ -45,7 +45,9 @@ impl Window {
             let otherwise = self.has_seen(context, *id, news.otherwise.iter());
             let seen = otherwise.map(|pattern| (pattern, false));
             let tolerated = || Some((self.has_seen(context, *id, news.changed.iter().filter(is_exact))?, true));
-            if let Some((pattern, is_tolerated)) = seen.or_else(tolerated) {
+            if let Some((pattern, is_tolerated)) = seen.or_else(tolerated)
+                && !self.goes_on(context, *id)
+            {
                 self.came_otherwise(context, *id, is_tolerated, format!("{pattern} was changed from outside"));
             }
         }

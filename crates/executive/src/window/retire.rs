@@ -12,6 +12,7 @@ use super::waits::Wait;
 use crate::binding;
 use crate::context::{Context, MAX_IDLE_VISITS, Made, in_circles};
 use crate::effects;
+use crate::interpreter::Interpreter;
 use crate::plan::{Effects, NodeNature, Outcome, SUCCEEDED, gives_outputs};
 use crate::protocol::{Command, Note};
 use ratn_model::fact::{Change, FactKey};
@@ -47,21 +48,28 @@ struct News {
     is_open: bool,
 }
 
-/// Whether a head ends something that began before: the sequential program follows all ends, then looks at waits, and only then begins
-/// states.
-fn is_end(role: Option<Role>) -> bool {
-    matches!(role, Some(Role::Exit | Role::Test | Role::RegionEnd | Role::Join | Role::End))
+/// Whether a head ends something that began before, now: the sequential program follows all ends, then looks at waits, and only then begins states.
+/// If it enters a state on its way to the head, that is where it begins.
+fn is_end(head: &Instance) -> bool {
+    match head.role() {
+        Some(Role::Exit | Role::Test | Role::RegionEnd | Role::Join | Role::End) => head.visits_before == 0,
+        Some(Role::Condition | Role::Loop | Role::Entry | Role::Fork) => false,
+        None => head.ended().is_some() && head.node().is_some_and(|node| ends_now(head, node)),
+    }
+}
+
+/// Whether a node that has ended has done so at its place. What has run ahead, or takes over a known result, ends later in the sequential program.
+fn ends_now(head: &Instance, node: &Node) -> bool {
+    head.is_pia() || node.is_at_its_place && (node.has_acted || node.answer.is_none())
 }
 
 impl Window {
-    /// Retires everything that can retire; true if anything did. All lines come up to their next node before a node retires: in the sequential
-    /// program a node that begins now ends later, when the other regions have gone on, too.
+    /// Retires everything that can retire; true if anything did. All lines come up to their next node before a node retires that has run ahead: in
+    /// the sequential program a node that begins now ends later, when the other regions have gone on, too.
     pub(super) fn retire(&mut self, context: &mut Context<'_>) -> bool {
         let mut retired = false;
         loop {
-            while self.retire_lines(context, Window::come_to_node) {
-                retired = true;
-            }
+            retired |= self.come_to_nodes(context);
             if !self.retire_lines(context, Window::retire_node) {
                 return retired;
             }
@@ -69,7 +77,7 @@ impl Window {
         }
     }
 
-    /// Lets one line after the other retire something; true if any did.
+    /// Lets one line after the other retire something; true if any did. Where a line comes to its end, the line around it goes on next.
     fn retire_lines(
         &mut self,
         context: &mut Context<'_>,
@@ -78,39 +86,104 @@ impl Window {
         let mut retired = false;
         let mut last = None;
         while let Some(line) = self.graph.next_active_line(last) {
-            last = Some(line);
             retired |= retires(self, context, line);
+            last = self.graph.has_line(line).then_some(line);
         }
         retired
     }
 
-    /// Retires what comes before the next node of a line; true if there was anything.
-    fn come_to_node(&mut self, context: &mut Context<'_>, line: LineId) -> bool {
+    /// Retires what comes before the next nodes of the lines, as the sequential program goes on: it follows all ends, ends one wait if one is over and
+    /// follows that, and only then the first line begins its next state. True if there was anything.
+    fn come_to_nodes(&mut self, context: &mut Context<'_>) -> bool {
+        let mut retired = false;
+        loop {
+            while self.end.is_none() && (self.retire_lines(context, Window::follow_ends) || self.ends_a_wait(context)) {
+                retired = true;
+            }
+            let mut last = None;
+            loop {
+                let Some(line) = self.graph.next_active_line(last).filter(|_| self.end.is_none()) else {
+                    if self.take_turns(context) {
+                        break;
+                    }
+                    return retired;
+                };
+                if !self.begin_next(context, line) {
+                    last = Some(line);
+                    continue;
+                }
+                retired = true;
+                // What has ended with it may end waits, or let the line around it go on.
+                self.follow_ends(context, line);
+                if !self.graph.has_line(line) || self.ends_a_wait(context) {
+                    break;
+                }
+            }
+        }
+    }
+
+    /// Begins, inside of routines, what has waited there for its turn at the routine's units; true if there was anything.
+    fn take_turns(&mut self, context: &mut Context<'_>) -> bool {
+        let heads = self.graph.active_heads().map(|head| head.id).filter(|id| self.goes_on_in_turn(*id));
+        heads.collect::<Vec<_>>().into_iter().any(|id| {
+            let takes = |routine: &mut Interpreter, context: &mut Context<'_>| {
+                let takes = routine.take_turns(context);
+                if !takes {
+                    routine.renew_leases(context);
+                }
+                takes
+            };
+            self.end.is_none() && self.with_routine(context, id, takes) == Some(true)
+        })
+    }
+
+    /// Retires the ends at which a line stands; true if there were any.
+    fn follow_ends(&mut self, context: &mut Context<'_>, line: LineId) -> bool {
         let mut retired = false;
         while self.end.is_none() {
             // A decision that depends on facts changed by another region must be made again before it retires.
             retired |= self.tell_of_crossings(context);
-            let Some(head) = self.graph.head_of(line).and_then(|id| self.graph.get(id)) else { break };
-            let (id, role, has_ended) = (head.id, head.role(), head.ended().is_some());
-            if !is_end(role) && self.ends_a_wait(context) {
+            if self.graph.lacks_head(line) && self.grow(context) {
+                continue;
+            }
+            let Some(id) = self.graph.head_of(line) else { break };
+            if self.goes_on_in_turn(id) && self.with_routine(context, id, Interpreter::follow_end) == Some(true) {
                 retired = true;
                 continue;
             }
-            // The sequential program goes on here before it goes on in the next region.
+            let Some(head) = self.graph.get(id).filter(|head| is_end(head)) else { break };
+            let has_ended = head.ended().is_some();
             if self.waits.takes(&mut self.graph, id) {
                 self.examine(context, id);
-                continue;
-            }
-            if role.is_none() {
-                self.come_to_its_place(context, id);
+            } else if has_ended && self.retire_head(context, id) {
+                retired = true;
+            } else {
                 break;
             }
-            if !has_ended || !self.retire_head(context, id) {
-                break;
-            }
-            retired = true;
         }
         retired
+    }
+
+    /// Begins the next state of a line, or a part of that; true if there was anything to begin.
+    fn begin_next(&mut self, context: &mut Context<'_>, line: LineId) -> bool {
+        self.tell_of_crossings(context);
+        let Some(head) = self.graph.head_of(line).and_then(|id| self.graph.get(id)).filter(|head| !is_end(head)) else {
+            return false;
+        };
+        let (id, is_node, has_ended) = (head.id, head.role().is_none(), head.ended().is_some());
+        // The sequential program goes on here before it goes on in the next region.
+        if self.waits.takes(&mut self.graph, id) {
+            self.examine(context, id);
+            return true;
+        }
+        if self.goes_on_in_turn(id) {
+            return self.with_routine(context, id, Interpreter::begin_next) == Some(true);
+        }
+        if is_node {
+            self.come_to_its_place(context, id);
+            return self.graph.get(id).is_some_and(is_end);
+        }
+        has_ended && self.retire_head(context, id)
     }
 
     /// Retires the head of a line, or passes it over, if it is a node; true if it did.
@@ -253,7 +326,15 @@ impl Window {
     /// An instance ended otherwise than computed ahead: discards everything behind it and continues the path where its outcome leads.
     fn leave_path(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: Outcome, reason: String) {
         let path = self.path(context.program, id);
-        let because: Arc<str> = if reason.is_empty() { path.into() } else { format!("{path}: {reason}").into() };
+        // A routine that was under way says where inside of it.
+        let says_where = self.graph.get(id).is_some_and(|instance| {
+            context.plan.state(instance.state).is_routine && instance.node().is_some_and(|node| node.has_acted)
+        });
+        let because: Arc<str> = match reason.is_empty() {
+            true => path.into(),
+            false if says_where => reason.into(),
+            false => format!("{path}: {reason}").into(),
+        };
         self.cut_behind(context, id);
         self.remove_and_depart(context, id, outcome, because);
     }

@@ -1,5 +1,5 @@
 //! States that wait: they begin as PIAs do, at the head of their line, but no provider gets a goal. Whenever the root has changed or a
-//! signal has come, every wait under way is checked, those inside of routines too.
+//! signal has come, every wait under way is checked in its turn, those inside of routines too.
 //!
 //! While a wait for a condition is under way, younger instances see the facts that its condition states literally; when it ends, the
 //! root's facts take their place. A wait never begins beside an imprecise PIA, and is never passed over, so no signal is taken on a path
@@ -12,6 +12,7 @@ use crate::awaiting::{self, WaitEnd};
 use crate::binding::{self, Bindings, Outputs};
 use crate::context::{Context, Made};
 use crate::protocol::{Awaited, Command, Event, Note};
+use crate::turn::Turn;
 use ratn_model::expression::Scope;
 use ratn_model::fact::Footprint;
 use ratn_model::id::InstanceId;
@@ -47,14 +48,15 @@ impl Window {
         }
     }
 
-    /// Checks waits and watched motions under way, if the world may have ended one, until one is over; true if one was. Its consequences are
-    /// handled before the others are checked.
+    /// Ends the first wait, or watched motion, that is over, if the world may have ended one since the last look; true if one was.
     pub(super) fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
         if !std::mem::take(&mut self.may_end_waits) {
             return false;
         }
-        for id in self.longest_waiting_first(context.program) {
-            if self.end.is_some() || self.is_over(context, id) {
+        let mut waiting: Vec<(Turn, InstanceId)> = self.waits_under_way(context.program).collect();
+        waiting.sort_unstable();
+        for (turn, id) in waiting {
+            if self.end.is_some() || self.is_over(context, turn.instance, id) {
                 self.may_end_waits = true;
                 return true;
             }
@@ -68,36 +70,33 @@ impl Window {
         self.look_at_waits(context)
     }
 
-    /// What is under way: what has waited longest first, then in the order of the lines.
-    fn longest_waiting_first(&self, program: &Program) -> Vec<InstanceId> {
-        let order = |id: &InstanceId| {
-            let instance = self.graph.get(*id)?;
-            let since = match &instance.node()?.status {
-                Status::Running(held) => Some(held.since),
-                Status::RunningRoutine(routine, since) => Some(routine.waits_since(program).unwrap_or(*since)),
+    /// The turns of the waits and watched motions under way, also inside of routines, each with the node that it is in.
+    pub(crate) fn waits_under_way<'a>(&'a self, program: &'a Program) -> impl Iterator<Item = (Turn, InstanceId)> + 'a {
+        let turns = move |id: InstanceId| {
+            let instance = self.graph.get(id)?;
+            let (state, place) = (program.state(instance.state), instance.line.place());
+            let own = match &instance.node()?.status {
+                Status::Running(held) if state.is_pause() || !state.annotations.holds.is_empty() => {
+                    Some(Turn { at: held.since, place, instance: id, state: state.id })
+                }
                 _ => None,
             };
-            Some((since?, instance.line, *id))
+            let routine = self.status_of_routine(id).filter(|routine| routine.is_actual());
+            let inside = routine.into_iter().flat_map(move |routine| routine.waits(program, place));
+            Some(own.into_iter().chain(inside).map(move |turn| (turn, id)))
         };
-        let mut all: Vec<_> = self.dispatch.active().filter_map(|id| order(&id)).collect();
-        all.sort_unstable();
-        all.into_iter().map(|(_, _, id)| id).collect()
+        self.dispatch.active().filter_map(turns).flatten()
     }
 
-    /// Checks a wait, a watched motion, or a routine with such inside; true if it has ended or gone on.
-    fn is_over(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
-        let Some(instance) = self.graph.get(id) else { return false };
-        match instance.node().map(|node| &node.status) {
-            Some(Status::Running(_)) if context.program.state(instance.state).is_pause() => {
-                self.ends_waiting(context, id)
-            }
-            Some(Status::Running(_)) => self.ends_violated(context, id),
-            Some(Status::RunningRoutine(..)) if context.plan.state(instance.state).is_watched => {
-                let before = context.commands.len();
-                self.tell_routine(context, id, Event::Woken);
-                context.commands.len() > before
-            }
-            _ => false,
+    /// Ends a wait, or a watched motion, if it is over; true if it was. What follows inside of a routine comes in its turn.
+    fn is_over(&mut self, context: &mut Context<'_>, inside: InstanceId, id: InstanceId) -> bool {
+        if inside != id {
+            return self.with_routine(context, id, |routine, context| routine.is_over(context, inside)) == Some(true);
+        }
+        match self.graph.get(id).map(|instance| context.program.state(instance.state).is_pause()) {
+            Some(true) => self.ends_waiting(context, id),
+            Some(false) => self.ends_violated(context, id),
+            None => false,
         }
     }
 

@@ -127,8 +127,16 @@ pub(crate) enum Timer {
     Hold(InstanceId),
     /// The instance has waited long enough for holders that only improve a result or are speculative.
     Room(InstanceId),
-    /// The task has reached its deadline.
-    Deadline,
+    /// Something inside of this routine is due.
+    Inside(InstanceId),
+}
+
+impl Timer {
+    pub(crate) fn instance(self) -> InstanceId {
+        match self {
+            Timer::Retry(id) | Timer::Timeout(id, _) | Timer::Hold(id) | Timer::Room(id) | Timer::Inside(id) => id,
+        }
+    }
 }
 
 /// The queue and the timers.
@@ -237,19 +245,14 @@ impl Waits {
         self.timers.insert((at, timer));
     }
 
-    /// The next timer that is due; among timeouts of one moment the one on the first line.
-    pub(crate) fn next_due(&mut self, graph: &Graph, now: Timestamp) -> Option<Timer> {
-        let first = *self.timers.first().filter(|(at, _)| *at <= now)?;
-        let alike = self.timers.iter().take_while(|(at, timer)| {
-            *at == first.0 && std::mem::discriminant(timer) == std::mem::discriminant(&first.1)
-        });
-        let line = |timer: &Timer| match timer {
-            Timer::Timeout(id, _) => graph.get(*id).map(|instance| instance.line),
-            _ => None,
-        };
-        let next = *alike.min_by_key(|(_, timer)| line(timer))?;
-        self.timers.remove(&next);
-        Some(next.1)
+    /// The timers that are due first, if they are by now.
+    pub(crate) fn first_due(&self, now: Timestamp) -> impl Iterator<Item = (Timestamp, Timer)> {
+        let first = self.timers.first().map(|(at, _)| *at).filter(|at| *at <= now);
+        self.timers.iter().copied().take_while(move |(at, _)| Some(*at) == first)
+    }
+
+    pub(crate) fn remove_timer(&mut self, at: Timestamp, timer: Timer) {
+        self.timers.remove(&(at, timer));
     }
 
     /// Checks, when the queue is empty, that every waiting instance is registered with the one that it waits for.

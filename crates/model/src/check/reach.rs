@@ -152,25 +152,26 @@ fn touched<'a>(program: &'a Program, region: &'a State) -> Touched<'a> {
 }
 
 /// The kind of a resource that one region creates, deletes or consumes while the other is affected. Blocking a created resource only waits.
-fn clash<'a>(one: &Touched<'a>, other: &Touched<'_>) -> Option<&'a str> {
+fn clash<'a>(program: &Program, one: &Touched<'a>, other: &Touched<'_>) -> Option<&'a str> {
     use ResourceOperation::{Block, Consume, Create, Delete, Exists};
     let sees = |changed: &ResourceExpr, seen: &ResourceExpr| match changed.operation {
         Delete | Consume => true,
         Create => matches!(seen.operation, Create | Exists),
         Block | Exists => false,
     };
-    let meets =
-        |changed: &ResourceExpr| other.resources.iter().any(|seen| may_be_one(changed, seen) && sees(changed, seen));
+    let meets = |changed: &ResourceExpr| {
+        other.resources.iter().any(|seen| may_be_one(program, changed, seen) && sees(changed, seen))
+    };
     one.resources.iter().find(|changed| meets(changed)).map(|changed| changed.kind.as_str())
 }
 
-/// Whether both lines may mean the same resource: they have the same kind and no attribute with different values.
-fn may_be_one(a: &ResourceExpr, b: &ResourceExpr) -> bool {
+/// Whether both lines may mean the same resource: their kinds are the same or related, and they have no attribute with different values.
+fn may_be_one(program: &Program, a: &ResourceExpr, b: &ResourceExpr) -> bool {
     let differ = |(name, value): &(String, Expr)| {
         let other = b.attributes.iter().find(|(other, _)| other == name).map(|(_, other)| other);
         matches!((value, other), (Expr::Literal(one), Some(Expr::Literal(another))) if one != another)
     };
-    a.kind == b.kind && !a.attributes.iter().any(differ)
+    program.may_be_one(&a.kind, &b.kind) && !a.attributes.iter().any(differ)
 }
 
 fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings) {
@@ -222,7 +223,8 @@ fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings)
             };
             let variable = touches(first, second).or_else(|| touches(second, first));
             let variable = variable.map(|name| format!("the variable `${name}`"));
-            let resource = clash(first, second).or_else(|| clash(second, first));
+            let program = subject.program;
+            let resource = clash(program, first, second).or_else(|| clash(program, second, first));
             let resource = resource.map(|kind| format!("the task resource {kind}"));
             // A watch reacts to a fact as soon as it is written, so it is no conflict.
             let is_watched = regions[i].is_watch() || other.is_watch();

@@ -74,6 +74,7 @@ impl Gone {
                     attempt,
                     reason: "it was stopped while task control was gone".to_owned(),
                     unknown: true,
+                    refused: false,
                 }
             }
             event => event,

@@ -43,6 +43,8 @@
 //! at = 1.0
 //! [choices]
 //! ask = { choice = "yes", after = 2.0 }    # what an operator answers, and so many seconds after the question
+//! [kinds]
+//! SmallPen = ["Pen"]                      # the superclasses of a kind of resource
 //! [[events]]
 //! event = "lease_lost"                    # what the instance of this path holds, before it has begun
 //! path = "move"
@@ -75,6 +77,7 @@ pub(crate) struct Script {
     pub(crate) inputs: bool,
     pub(crate) ends_only: bool,
     resources: BTreeMap<String, u32>,
+    pub(crate) kinds: BTreeMap<String, Vec<String>>,
     durations: BTreeMap<String, f64>,
     outcomes: BTreeMap<String, OneOrMore>,
     outputs: BTreeMap<String, BTreeMap<String, toml::Value>>,
@@ -228,7 +231,13 @@ impl Outside {
                 let paths = super::paths(run);
                 let mut holders = run.log.iter().filter_map(|line| granted(&line.entry));
                 let instance = holders.find(|instance| paths[instance] == path).unwrap();
-                Event::Crashed { instance, attempt: 1, reason: "its lease was lost".to_owned(), unknown: false }
+                Event::Crashed {
+                    instance,
+                    attempt: 1,
+                    reason: "its lease was lost".to_owned(),
+                    unknown: false,
+                    refused: false,
+                }
             }
             other => panic!("event: one of those above, not {other}"),
         }

@@ -35,6 +35,8 @@ pub(super) const GRACE_MS: u64 = DEFAULT_TTL.as_millis() as u64;
 const WITHDRAWAL_DEADLINE: Duration = Duration::from_secs(DEFAULT_TTL.as_secs() + 1);
 /// Reason code: the provider still runs another run's cancelled goal.
 const STILL_RUNNING: &str = "STILL_RUNNING";
+/// Reason codes of a provider that does not begin a goal because its lease is over.
+const LEASE_OVER: [&str; 2] = ["LEASE_REFUTED", "LEASE_FENCED"];
 /// A worker that refuses for this reason is kept this long before another one is acquired: an immediate acquire would get the same worker again.
 const STILL_RUNNING_PAUSE: Duration = Duration::from_secs(5);
 /// Interval at which the withdrawal of a resource is checked.
@@ -347,7 +349,7 @@ impl Performing {
             },
             _ => said(error),
         };
-        self.crashed(reason)
+        self.crashed(reason, LEASE_OVER.contains(&error.reason()))
     }
 
     /// How the process of a provider ended, according to the process manager of its host; `None` if unknown.
@@ -459,15 +461,15 @@ impl Performing {
         self.finished(GoalOutcome { outputs, reason, ..GoalOutcome::named(ABORTED) })
     }
 
-    fn crashed(&self, reason: String) -> Event {
+    fn crashed(&self, reason: String, refused: bool) -> Event {
         let (instance, attempt, reason) = (self.instance, self.attempt, readable(&reason));
-        Event::Crashed { instance, attempt, reason, unknown: false }
+        Event::Crashed { instance, attempt, reason, unknown: false, refused }
     }
 
     /// A crash after which it is unknown whether the goal was performed.
     fn unknown(&self, reason: String) -> Event {
         let (instance, attempt, reason) = (self.instance, self.attempt, readable(&reason));
-        Event::Crashed { instance, attempt, reason, unknown: true }
+        Event::Crashed { instance, attempt, reason, unknown: true, refused: false }
     }
 }
 

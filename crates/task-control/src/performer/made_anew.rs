@@ -1,8 +1,9 @@
 //! Resuming a run whose session has ended: asks the resource manager which of the run's operations are done, makes again what went with the session,
 //! and performs the rest.
 //!
-//! Nothing that is made again outlasts the new session, and an operation that is done for the first time is done under its own request id. So a
-//! resumption that dies on the way leaves nothing that the next one does not find.
+//! Nothing that is made again outlasts the new session, and an operation that is done for the first time is done under its own request id. It may take
+//! of what was made again, so the log says the new ids before. So a resumption that dies or is refused on the way leaves nothing that the next one does
+//! not find.
 
 use super::Performer;
 use crate::decided::{Unanswered, Undone, insist};
@@ -20,6 +21,12 @@ const GONE: &str = "RESOURCE_UNKNOWN";
 /// The resources that the run had created: old id to new id.
 type Renamed = BTreeMap<String, String>;
 
+/// The operations that are left to do, when all else has been made again under these ids.
+pub(super) struct Rest {
+    renamed: Renamed,
+    open: Vec<Unfinished>,
+}
+
 impl Performer {
     /// Settles the operations without an answer of a run whose session has ended; if the session lives, they are simply requested again.
     pub(super) async fn settle(&self, ledger: &Ledger) -> anyhow::Result<Settled> {
@@ -34,8 +41,8 @@ impl Performer {
     }
 
     /// Makes again what the run had created and used up in its old session. Others' resources that the run deleted stay deleted, as does some of what
-    /// it used up. Then performs the open operations. Returns the events for the log.
-    pub(super) async fn make_anew(&self, settled: Settled, before: &Ledger) -> anyhow::Result<Vec<Event>> {
+    /// it used up. Returns the events for the log, which has to have them before the rest is done.
+    pub(super) async fn make_anew(&self, settled: Settled, before: &Ledger) -> anyhow::Result<(Vec<Event>, Rest)> {
         let Settled { account, done, open } = settled;
         if let Some(operation) = account.unknown() {
             bail!(
@@ -55,6 +62,12 @@ impl Performer {
             units: Vec::new(),
             renamed: renamed.clone(),
         });
+        Ok((told, Rest { renamed, open }))
+    }
+
+    /// Performs the open operations. Returns the events for the log.
+    pub(super) async fn do_the_rest(&self, Rest { renamed, open }: Rest) -> anyhow::Result<Vec<Event>> {
+        let mut told = Vec::new();
         for unfinished in open {
             told.push(self.operate_anew(unfinished, &renamed).await?);
         }

@@ -14,6 +14,7 @@
 use super::Performer;
 use super::came_between::{CameBetween, ChangedByOthers, Untouched, refuse, retry_forgotten};
 use super::goal::Given;
+use super::made_anew::Rest;
 use crate::decided::{Unanswered, Undone, insist};
 use crate::ledger::{Confirmed, Ledger, Operated, WentBack, late_request};
 use crate::outside;
@@ -51,6 +52,17 @@ struct Missing {
     behind: Vec<Decided>,
     /// Up to this revision no change by others conflicts with them.
     seen: Revision,
+}
+
+/// A run that is taken up as far as its goals, its commits and what it had made: the rest comes when its log says the latter.
+pub(crate) struct TakenUp {
+    ledger: Ledger,
+    missing: Missing,
+    changed: Option<Event>,
+    /// Cancelled when the earlier withdrawals are done.
+    withdrawn: CancellationToken,
+    /// What is left to do in a new session.
+    rest: Option<Rest>,
 }
 
 /// Refuses a world that is not the run's. Changes nothing.
@@ -157,8 +169,8 @@ impl Performer {
         Ok(changed(revision, facts, &ledger.commits[there..], mirror))
     }
 
-    /// Takes up everything that is open, in the order of decision; `now` is the time of the run. Returns the events for the executive: that
-    /// everything was made again in a new session, and what has changed from outside meanwhile.
+    /// Takes up what is open, up to the operations that are perhaps not done; `now` is the time of the run. Returns the events that the log has to have
+    /// before [`Performer::go_on`]: that everything was made again in a new session.
     ///
     /// # Errors
     /// If the run cannot go on.
@@ -168,7 +180,7 @@ impl Performer {
         mut ledger: Ledger,
         mirror: &World,
         now: Timestamp,
-    ) -> anyhow::Result<Vec<Event>> {
+    ) -> anyhow::Result<(Vec<Event>, TakenUp)> {
         let settled = if self.is_own { None } else { Some(self.settle(&ledger).await?) };
         let (missing, revision, facts) = self.commit_again(program, &ledger, now).await?;
         let changed = changed(revision, facts, &missing.behind, mirror);
@@ -180,9 +192,23 @@ impl Performer {
         }
         // Operations wait for these withdrawals.
         let withdrawn = self.withdraw_again(std::mem::take(&mut ledger.withdrawn));
+        let (told, rest) = match settled {
+            Some(settled) => self.make_anew(settled, &ledger).await.map(|(told, rest)| (told, Some(rest)))?,
+            None => (Vec::new(), None),
+        };
+        Ok((told, TakenUp { ledger, missing, changed, withdrawn, rest }))
+    }
+
+    /// Takes up the rest, in the order of decision. Returns the events for the executive: the operations that are done in a new session, and what has
+    /// changed from outside meanwhile.
+    ///
+    /// # Errors
+    /// If the run cannot go on.
+    pub(crate) async fn go_on(&mut self, program: &Arc<Program>, taken: TakenUp) -> anyhow::Result<Vec<Event>> {
+        let TakenUp { ledger, missing, changed, withdrawn, rest } = taken;
         let mut recorded = Vec::new();
-        if let Some(settled) = settled {
-            recorded = self.make_anew(settled, &ledger).await?;
+        if let Some(rest) = rest {
+            recorded = self.do_the_rest(rest).await?;
             let operation = ledger.operations;
             self.confirm(Confirmed { operation, ..self.confirmed() });
         } else {
@@ -205,7 +231,8 @@ impl Performer {
     }
 
     /// Performs what a run that has ended had decided and perhaps not done: its commits and its operations. If its session has ended, only the
-    /// operations that take something away: what it had created is gone with the session. Returns the number of each. `now` is the time of the run.
+    /// operations that take something away: what it had created is gone with the session. Returns the number of each. `now` is the time of the run;
+    /// `log` makes events durable in the run's log.
     ///
     /// # Errors
     /// If the commits cannot be made.
@@ -214,6 +241,7 @@ impl Performer {
         program: &Arc<Program>,
         mut ledger: Ledger,
         now: Timestamp,
+        log: impl FnOnce(&[Event]) -> anyhow::Result<()>,
     ) -> anyhow::Result<(usize, usize)> {
         let settled = if self.is_own { None } else { Some(self.settle(&ledger).await?) };
         let (missing, ..) = self.commit_again(program, &ledger, now).await?;
@@ -221,7 +249,9 @@ impl Performer {
         if let Some(settled) = settled {
             let removed = settled.removals();
             if removed > 0 {
-                self.make_anew(settled, &ledger).await?;
+                let (told, rest) = self.make_anew(settled, &ledger).await?;
+                log(&told)?;
+                self.do_the_rest(rest).await?;
             }
             // Nothing of the run is open any more for later resumptions.
             self.recorded.send_modify(|recorded| recorded.operation = ledger.operations);

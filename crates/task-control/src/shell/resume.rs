@@ -166,7 +166,18 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         shell.hand_over()?;
         shell.log.make_durable()?;
         shell.performer.know(shell.progress.paths());
-        let told = shell.performer.take_up(&Arc::clone(&shell.program), ledger, &mirror, now).await?;
+        let program = Arc::clone(&shell.program);
+        let (made, taken) = shell.performer.take_up(&program, ledger, &mirror, now).await?;
+        if !made.is_empty() {
+            for event in &made {
+                let (later, more) = shell.decide(event)?;
+                now = later;
+                commands.extend(more);
+            }
+            shell.hand_over()?;
+            shell.log.make_durable()?;
+        }
+        let told = shell.performer.go_on(&program, taken).await?;
         // Recorded commands were taken from the ledger.
         let missing = missing.into_iter().filter(|command| !replay::is_recorded(command));
         let mut ended = shell.perform(now, missing.chain(commands), None)?;
@@ -214,7 +225,11 @@ async fn finish(resumption: Resumption, ended: Ended, place: &Place) -> anyhow::
         ledger.event(at, &lost);
     }
     let now = replay::now(&ledger, unix_ms(), place.speed);
-    let finished = performer.finish(&program, ledger, now).await;
+    let makes_durable = |told: &[Event]| {
+        told.iter().try_for_each(|event| log.append(at, event, &[]))?;
+        Ok(log.make_durable()?)
+    };
+    let finished = performer.finish(&program, ledger, now, makes_durable).await;
     let (done, closed) = performer.close().await;
     done.iter().try_for_each(|event| log.append(at, event, &[]))?;
     let (commits, operations) = finished?;

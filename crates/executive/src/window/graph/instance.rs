@@ -20,10 +20,10 @@ use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
 use std::sync::Arc;
 
+pub(crate) use super::lines::LineId;
+
 /// Number of a stretch of the window between two decisions. It is certain unless a branch with this number is open.
 pub(crate) type SegmentId = u64;
-/// A thread of control: the task's, or a region's.
-pub(crate) type LineId = u64;
 
 /// One visit of a state. Only the graph changes it; everybody may look at it.
 #[derive(Serialize, Deserialize)]

@@ -1,12 +1,28 @@
 //! Lines: threads of control, the task's and one per region. Each line retires in program order, so each has a head.
 
-use super::instance::LineId;
 use ratn_model::id::InstanceId;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::ops::Bound::{Excluded, Unbounded};
+
+/// A thread of control: the task's, or a region's. They are in the order in which the regions are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub(crate) struct LineId {
+    /// The place of the region in the program ([`crate::plan::StatePlan::place`]).
+    place: u64,
+    /// Its number among all lines.
+    number: u64,
+}
+
+impl LineId {
+    /// The place of its region in the program.
+    pub(crate) fn place(self) -> u64 {
+        self.place
+    }
+}
 
 /// The task's own line.
-pub(crate) const MAIN: LineId = 0;
+pub(crate) const MAIN: LineId = LineId { place: 0, number: 0 };
 
 /// One thread of control.
 #[derive(Debug, Default, Serialize, Deserialize)]
@@ -28,20 +44,21 @@ struct Line {
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Lines {
     all: BTreeMap<LineId, Line>,
-    last: LineId,
+    last: u64,
 }
 
 impl Lines {
     /// The task's line only.
     pub(super) fn new() -> Lines {
-        Lines { all: BTreeMap::from([(MAIN, Line { is_active: true, ..Line::default() })]), last: MAIN }
+        Lines { all: BTreeMap::from([(MAIN, Line { is_active: true, ..Line::default() })]), last: 0 }
     }
 
-    /// Adds the line of a region; it begins when its fork retires.
-    pub(super) fn open(&mut self, fork: InstanceId) -> LineId {
+    /// Adds the line of a region at this place of the program; it begins when its fork retires.
+    pub(super) fn open(&mut self, fork: InstanceId, place: u64) -> LineId {
         self.last += 1;
-        self.all.insert(self.last, Line { fork: Some(fork), ..Line::default() });
-        self.last
+        let line = LineId { place, number: self.last };
+        self.all.insert(line, Line { fork: Some(fork), ..Line::default() });
+        line
     }
 
     pub(super) fn contains(&self, line: LineId) -> bool {
@@ -50,8 +67,8 @@ impl Lines {
 
     /// The next line after `after` whose fork has retired.
     pub(super) fn next_active(&self, after: Option<LineId>) -> Option<LineId> {
-        let from = after.map_or(0, |line| line + 1);
-        self.all.range(from..).find(|(_, line)| line.is_active).map(|(id, _)| *id)
+        let from = after.map_or(Unbounded, Excluded);
+        self.all.range((from, Unbounded)).find(|(_, line)| line.is_active).map(|(id, _)| *id)
     }
 
     pub(super) fn head(&self, line: LineId) -> Option<InstanceId> {
@@ -116,8 +133,8 @@ impl Lines {
         line.open_regions == 0
     }
 
-    /// Whether a line has come to a join that is not expanded yet.
-    pub(super) fn waits_for_its_join(&self, line: LineId) -> bool {
+    /// Whether a line has come to what is not expanded yet, perhaps a join.
+    pub(super) fn lacks_head(&self, line: LineId) -> bool {
         self.all.get(&line).is_some_and(|line| line.open_regions == 0 && line.head.is_none())
     }
 

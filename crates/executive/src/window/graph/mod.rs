@@ -144,9 +144,9 @@ impl Graph {
         segment
     }
 
-    /// Adds a region behind a fork; returns its line and the number of its arm.
-    pub(crate) fn open_region(&mut self, id: InstanceId) -> (LineId, usize) {
-        let line = self.lines.open(id);
+    /// Adds a region, which is at this place of the program, behind a fork; returns its line and the number of its arm.
+    pub(crate) fn open_region(&mut self, id: InstanceId, place: u64) -> (LineId, usize) {
+        let line = self.lines.open(id, place);
         let mut arm = 0;
         if let Some(fork) = self.instances.get_mut(id) {
             arm = fork.arms.len();
@@ -181,7 +181,7 @@ impl Graph {
         let Some(record) = self.forks.get_mut(&fork) else { return };
         record.join = Some(join);
         let line = record.line;
-        if self.lines.waits_for_its_join(line) && !self.contains(fork) {
+        if self.lines.lacks_head(line) && !self.contains(fork) {
             self.set_head(line, Some(join));
         }
     }
@@ -267,6 +267,11 @@ impl Graph {
     /// The head of a line, unless the line waits for regions.
     pub(crate) fn head_of(&self, line: LineId) -> Option<InstanceId> {
         self.lines.head(line)
+    }
+
+    /// Whether a line has come to what is not expanded yet.
+    pub(crate) fn lacks_head(&self, line: LineId) -> bool {
+        self.lines.lacks_head(line)
     }
 
     /// The heads of the lines that have begun and wait for no region.
@@ -456,7 +461,7 @@ impl Graph {
         for (id, fork) in &self.forks {
             reached.extend(fork.join);
             if !self.contains(*id) && !self.lines.contains(fork.line) {
-                return Err(format!("fork {id} has retired on line {}, which is gone", fork.line));
+                return Err(format!("fork {id} has retired on line {:?}, which is gone", fork.line));
             }
         }
         for instance in self.iter() {
@@ -481,11 +486,11 @@ impl Graph {
                 }
             }
             if !self.lines.contains(instance.line) && !instance.is_orphan() {
-                return Err(format!("{} is on line {}, which is gone", instance.id, instance.line));
+                return Err(format!("{} is on line {:?}, which is gone", instance.id, instance.line));
             }
         }
         match self.iter().find(|instance| !reached.contains(&instance.id)) {
-            Some(lost) => Err(format!("nobody can reach {} on line {}", lost.id, lost.line)),
+            Some(lost) => Err(format!("nobody can reach {} on line {:?}", lost.id, lost.line)),
             None => Ok(()),
         }
     }

@@ -23,6 +23,7 @@ mod regions;
 mod table;
 mod walk;
 
+use super::graph::instance::LineId;
 use super::graph::{Graph, MAIN, Pruned};
 use crate::context::{Context, MAX_IDLE_VISITS, in_circles};
 use crate::plan::{Outcome, Plan};
@@ -54,7 +55,7 @@ pub(crate) struct Growth {
 /// Where a path continues that was left.
 pub(crate) struct Departure {
     pub(crate) environment: Environment,
-    pub(crate) line: u64,
+    pub(crate) line: LineId,
     pub(crate) position: u64,
     pub(crate) state: StateId,
     pub(crate) outcome: Outcome,
@@ -273,10 +274,10 @@ impl Growth {
                 && !graph.contains(id)
                 && !self.regions.contains_key(&id)
             {
-                return Err(format!("a cursor of line {} waits for {id}, which is not in the window", cursor.line));
+                return Err(format!("a cursor of line {:?} waits for {id}, which is not in the window", cursor.line));
             }
             if !graph.has_line(cursor.line) {
-                return Err(format!("a cursor is on line {}, which is gone", cursor.line));
+                return Err(format!("a cursor is on line {:?}, which is gone", cursor.line));
             }
         }
         Ok(())

@@ -56,7 +56,7 @@ impl Growth {
         graph.note_fork(fork);
         let template = self.cursors[index].clone();
         for region in regions {
-            let (line, arm) = graph.open_region(fork);
+            let (line, arm) = graph.open_region(fork, context.plan.state(*region).place);
             let frame = Frame {
                 below: template.environment.frames.clone(),
                 owner: state.id,

@@ -358,6 +358,24 @@ async fn a_worker_that_still_runs_anothers_goal_is_kept_for_a_while_and_not_aske
 }
 
 #[tokio::test]
+async fn a_goal_that_is_refused_because_its_lease_is_over_was_not_begun() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    for (reason, expected) in [("LEASE_REFUTED", true), ("LEASE_FENCED", true), ("LEASE_UNKNOWN", false)] {
+        let bound = bind(&Endpoint::Unix(bench._place.path().join(format!("{reason}.sock")))).await?;
+        let mut performing = bench.performing("work", None, 0);
+        performing.endpoint = Ok(bound.endpoint().clone());
+        let details = ErrorDetails::with_error_info(reason, "ratn", HashMap::<String, String>::new());
+        let status = Status::with_error_details(Code::FailedPrecondition, "lease-1 is over", details);
+        let services = Services::new().with(ActionServiceServer::new(Elsewhere(Err(status))));
+        tokio::spawn(bound.serve(services, CancellationToken::new()));
+        performing.perform(Given::Now).await;
+        let Some(Event::Crashed { refused, .. }) = bench.event().await else { anyhow::bail!("no crash: {reason}") };
+        assert_eq!(refused, expected, "{reason}");
+    }
+    Ok(())
+}
+
+#[tokio::test]
 async fn who_comes_back_to_a_goal_hears_of_the_result_that_it_has_given() -> anyhow::Result<()> {
     let mut bench = Bench::new().await?;
     let endless = |bench: &Bench| {

@@ -201,7 +201,9 @@ async fn taken_up_once() -> anyhow::Result<(Bench, Ledger, u64)> {
     bench.performer.world.commit("other/i1/1", by_others("done"), None).await?;
     let mut bench = bench.comes_back(false).await?;
     bench.loses(&mut ledger).await?;
-    let told = bench.performer.take_up(&fetch_boxes(), ledger.clone(), &World::default(), Timestamp(0)).await?;
+    let program = fetch_boxes();
+    let (mut told, taken) = bench.performer.take_up(&program, ledger.clone(), &World::default(), Timestamp(0)).await?;
+    told.extend(bench.performer.go_on(&program, taken).await?);
     told.iter().for_each(|event| ledger.event(Timestamp(0), event));
     let again = start(InstanceId(2), 2, "work", LeaseId(2), "");
     for command in [again, commits_what(2, 2, by_others("tidy"))] {

@@ -198,17 +198,31 @@ impl Bench {
     }
 
     /// Takes up the log's open items, as a resumption does: the loss of its leases is logged before.
-    async fn takes_up(&mut self, mut ledger: Ledger, mirror: &World) -> anyhow::Result<Vec<Event>> {
+    async fn takes_up(&mut self, ledger: Ledger, mirror: &World) -> anyhow::Result<Vec<Event>> {
+        let mut told = Vec::new();
+        let more = self.takes_up_saying(ledger, mirror, |event| told.push(event.clone())).await?;
+        Ok(told.into_iter().chain(more).collect())
+    }
+
+    /// The same; `log` gets what has to be in the log before the operations.
+    async fn takes_up_saying(
+        &mut self,
+        mut ledger: Ledger,
+        mirror: &World,
+        log: impl FnMut(&Event),
+    ) -> anyhow::Result<Vec<Event>> {
         self.loses(&mut ledger).await?;
-        let now = ledger.last;
-        self.performer.take_up(&fetch_boxes(), ledger, mirror, now).await
+        let (now, program) = (ledger.last, fetch_boxes());
+        let (told, taken) = self.performer.take_up(&program, ledger, mirror, now).await?;
+        told.iter().for_each(log);
+        self.performer.go_on(&program, taken).await
     }
 
     /// Performs what a run that has ended had decided.
     async fn finishes(&mut self, mut ledger: Ledger) -> anyhow::Result<(usize, usize)> {
         self.loses(&mut ledger).await?;
         let now = ledger.last;
-        self.performer.finish(&fetch_boxes(), ledger, now).await
+        self.performer.finish(&fetch_boxes(), ledger, now, |_| Ok(())).await
     }
 
     async fn loses(&self, ledger: &mut Ledger) -> anyhow::Result<()> {

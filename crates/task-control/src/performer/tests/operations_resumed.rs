@@ -94,7 +94,15 @@ impl Operating {
         std::mem::replace(&mut self.bench.performer, again).session.close().await;
         self.bench.performer = connect_as(&self.bench.endpoints, &run, Some(before), "task", events).await?;
         self.bench.answers = answers;
-        self.bench.takes_up(self.ledger.clone(), &World::default()).await
+        let mut told = Vec::new();
+        let open = self.ledger.clone();
+        match self.bench.takes_up_saying(open, &World::default(), |event| told.push(event.clone())).await {
+            Ok(more) => Ok(told.into_iter().chain(more).collect()),
+            Err(refused) => {
+                told.iter().for_each(|event| self.ledger.event(Timestamp(0), event));
+                Err(refused)
+            }
+        }
     }
 
     /// The free units of each resource of a kind; `own` is a resource that the run has created.
@@ -150,6 +158,21 @@ async fn a_deletion_of_more_than_a_run_has_created_is_done_when_it_comes_back() 
     run.decides(Requirement { count: 2.into(), ..delete("Box") });
     run.comes_back().await?;
     assert_eq!(run.free("Box").await?, of(&[("operators", 1)]));
+    run.bench.performer.closed().await
+}
+
+#[tokio::test]
+async fn what_was_made_anew_and_deleted_is_not_made_anew_where_the_next_operation_was_refused() -> anyhow::Result<()> {
+    let mut run = Operating::new(ResourceManagerConfig::default()).await?;
+    run.there_is("operators", "Box", 1).await?;
+    run.does(create("Box", 2)).await?;
+    run.decides(Requirement { count: 2.into(), ..delete("Box") });
+    run.decides(consume("Glue"));
+    let refused = run.comes_back().await.err().context("there is no glue")?;
+    assert!(refused.to_string().contains("cannot be done now"), "{refused}");
+    run.there_is("glue", "Glue", 1).await?;
+    run.comes_back().await?;
+    assert_eq!((run.free("Box").await?, run.free("Glue").await?), (of(&[("operators", 1)]), of(&[("glue", 0)])));
     run.bench.performer.closed().await
 }
 

@@ -194,7 +194,7 @@ async fn behind_what_had_failed_nothing_is_made_by_who_comes_back() -> anyhow::R
     assert_eq!((missing_commits(&place, &ledger).await?, ledger.open_operations().count()), (Some(0), 0));
     let (events, _answers) = mpsc::channel(8);
     let mut late = connect_as(&bench.endpoints, &run, None, "task", events).await?;
-    assert_eq!(late.finish(&fetch_boxes(), ledger, Timestamp(0)).await?, (0, 0));
+    assert_eq!(late.finish(&fetch_boxes(), ledger, Timestamp(0), |_| Ok(())).await?, (0, 0));
     assert_eq!(late.root().await?.0, Revision(1));
     late.closed().await?;
     bench.performer.closed().await
@@ -275,7 +275,7 @@ async fn of_a_run_that_has_ended_what_was_not_recorded_is_made_and_nothing_else(
     // The session is over, and with it the resources that it had created.
     let (events, _answers) = mpsc::channel(1);
     let mut late = connect_as(&bench.endpoints, &run, Some(session), "task", events).await?;
-    assert_eq!(late.finish(&fetch_boxes(), ledger.clone(), Timestamp(0)).await?, (0, 0));
+    assert_eq!(late.finish(&fetch_boxes(), ledger.clone(), Timestamp(0), |_| Ok(())).await?, (0, 0));
     assert!(late.resources.list(&["Box"]).await?.is_empty());
     late.closed().await?;
     let other = Ledger { first_revision: Revision(9), ..ledger };
