@@ -108,6 +108,19 @@ fn a_way_through_the_table_is_driven_and_judged() {
 }
 
 #[test]
+fn what_stands_on_the_deck_is_told_where_the_base_drives_it_into_the_table() {
+    let mut bench = Bench::new(1, 7);
+    load(&mut bench);
+    assert_eq!(bench.cell.unintended_contacts(), []);
+    let empty = Scene { base: Pose::IDENTITY, objects: vec![] };
+    let through = way(&bench, &empty, [1.2, 0.0, 0.0]);
+    bench.done(Request::Drive { trajectory: through });
+    let touched = bench.cell.unintended_contacts();
+    let rider = ["table".to_owned(), "slc_1".to_owned()];
+    assert!(touched.iter().any(|c| c.bodies == rider && c.depth_m > 0.01), "{touched:?}");
+}
+
+#[test]
 fn a_way_from_elsewhere_is_refused_with_the_reason() {
     let mut bench = Bench::new(1, 7);
     stow(&mut bench);

@@ -111,6 +111,15 @@ fn a_trajectory_that_is_too_fast_or_starts_elsewhere_or_meets_the_robot_itself_i
     let refused = bench.perform(Request::Follow { trajectory: too_fast });
     assert!(matches!(&refused, Ending::Aborted(reason) if reason.contains("limit")), "{refused:?}");
 
+    // The first joint would have to begin with 18 rad/s² to be where it starts; its limit is less. So near as 1 mrad it is.
+    for (off_rad, is_refused) in [(0.005, true), (0.001, false)] {
+        let mut beside = from_home.clone();
+        beside.points.iter_mut().for_each(|point| point.positions[0] += off_rad);
+        let ended = Bench::new(1, 7).perform(Request::Follow { trajectory: beside });
+        let is_told = matches!(&ended, Ending::Aborted(reason) if reason.contains("starts at"));
+        assert_eq!(is_told, is_refused, "{ended:?}");
+    }
+
     bench.done(Request::Follow { trajectory: from_home.clone() });
     let refused = bench.perform(Request::Follow { trajectory: from_home });
     assert!(matches!(&refused, Ending::Aborted(reason) if reason.contains("starts at")), "{refused:?}");

@@ -32,8 +32,11 @@ const PADDING_M: f64 = 0.02;
 /// Maximum distance of a trajectory's start from the base's place, in metres and in radians.
 pub const START_TOLERANCE: f64 = 0.02;
 
-/// An object stands on the deck if its lowest point is within this distance of the deck, in metres.
-const STANDS_M: f64 = 0.03;
+/// An object stands on the deck if its lowest point is within this distance of the deck, in metres: poses are measured with an error of millimetres.
+const STANDS_M: f64 = 0.01;
+
+/// … and if it reaches beyond the deck's edges by no more than this, in metres: what reaches further may stand on something else.
+const BEYOND_M: f64 = 0.03;
 
 /// Maximum tolerances, in metres and in radians.
 const MAX_TOLERANCE: f64 = 1.0;
@@ -160,7 +163,7 @@ pub enum DriveViolation {
     },
 }
 
-/// Objects on the robot's deck: their centre is above the deck and their lowest point at its height.
+/// Objects on the robot's deck: they are within its edges, and their lowest point is at its height.
 pub fn riding(robot: &Robot, scene: &Scene) -> Vec<String> {
     let standing = robot.at_zero().with_base(&scene.base);
     let Some(base) = robot.body() else { return Vec::new() };
@@ -169,8 +172,10 @@ pub fn riding(robot: &Robot, scene: &Scene) -> Vec<String> {
         robot.model.links[base].bodies.iter().any(|deck| {
             let Geometry::Box { half } = deck.geometry else { return false };
             let seen = frame.compose(&deck.pose).inverse().compose(pose);
-            let low = geometry.shape(0.0).compute_aabb(&to_f32(&geometry.at(seen).pose)).mins.z;
-            (0..2).all(|i| seen.position[i].abs() <= half[i]) && (f64::from(low) - half[2]).abs() <= STANDS_M
+            let around = geometry.shape(0.0).compute_aabb(&to_f32(&geometry.at(seen).pose));
+            let [mins, maxs] = [around.mins, around.maxs].map(|corner| corner.to_array().map(f64::from));
+            let is_within = (0..2).all(|i| maxs[i].max(-mins[i]) <= half[i] + BEYOND_M);
+            is_within && (mins[2] - half[2]).abs() <= STANDS_M
         })
     };
     let on_deck = scene.objects.iter().filter(|object| match object.placement {

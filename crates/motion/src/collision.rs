@@ -22,16 +22,17 @@ use crate::request::kept_out;
 use crate::robot::{Configuration, Geometry, Robot, to_f32};
 use crate::robot_model::Joint;
 use crate::solid::{Placed, Solid};
+use crate::space::Obstacle as Standing;
 use parry3d::math::{Pose as Pose32, Vector};
 use ratn_model::pose::Pose;
-use ratn_world::scene::{Placement, Scene, Shape};
+use ratn_world::scene::{Scene, Shape};
 use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
 
 mod touching;
 
-pub(crate) use touching::Touch;
+pub(crate) use touching::{Against, Touch};
 
 /// Clearance that the planner keeps around the moving shapes at the start and the end, in metres.
 pub const PADDING_M: f64 = crate::arm::OVERHANG_M;
@@ -50,7 +51,9 @@ const UNPADDED_STEP_M: f64 = 0.005;
 pub struct Checker<'a> {
     robot: &'a Robot,
     padding: f64,
-    /// Positions of all joints; the arm's are those of the posture checked last.
+    /// The pose of the base in the world frame. Everything is checked in the frame of the base: far from the world's origin `f32` is too coarse.
+    base: Pose,
+    /// Positions of all joints, with the base at zero; the arm's are those of the posture checked last.
     configuration: Configuration,
     obstacles: Vec<Obstacle>,
     moving: Vec<Moving>,
@@ -58,7 +61,7 @@ pub struct Checker<'a> {
     pairs: Vec<(usize, usize)>,
     /// Links with meshes that have no padding beside each other.
     close: BTreeSet<Pair>,
-    /// Point cloud of balls around the robot, in the world frame.
+    /// Point cloud of balls around the robot, in the frame of the base.
     cloud: Option<Arc<Cloud>>,
     /// Maximum motion of any point, or of two shapes towards each other, per radian of each arm joint (per metre of a prismatic joint), in metres.
     reach: JointVector,
@@ -168,12 +171,13 @@ impl fmt::Display for Collision {
 impl<'a> Checker<'a> {
     /// A checker of `robot` in `scene`. Everything but arm and base is as in `here`; the base is where the scene has it.
     pub fn new(robot: &'a Robot, scene: &Scene, here: &Configuration, padding: f64) -> Checker<'a> {
-        let configuration = here.with_base(&scene.base);
+        let configuration = Configuration { base: [0.0; 3], ..*here };
         let poses = robot.poses(&configuration);
         let arm = crate::arm::holding(robot, scene, &configuration);
         let mut checker = Checker {
             robot,
             padding,
+            base: crate::arm::on_floor(robot, &scene.base),
             configuration,
             obstacles: Vec::new(),
             moving: Vec::new(),
@@ -206,7 +210,7 @@ impl<'a> Checker<'a> {
     pub fn keeping_out_of(mut self, regions: &[Region]) -> Checker<'a> {
         for (i, Region { pose, size }) in regions.iter().enumerate() {
             let part = Part::standing(&Geometry::from(&Shape::Box { size: *size }));
-            self.add_obstacle(kept_out(i), None, *pose, part, Entry::Never);
+            self.add_obstacle(kept_out(i), None, self.base.inverse().compose(pose), part, Entry::Never);
         }
         let all = 0..self.obstacles.len();
         let regions = all.clone().skip(all.len() - regions.len());
@@ -247,7 +251,7 @@ impl<'a> Checker<'a> {
         self.centres.truncate(kept.len());
     }
 
-    /// The same checker with a point cloud in the world frame.
+    /// The same checker with a point cloud in the frame of the base.
     pub fn beside(self, cloud: Option<Arc<Cloud>>) -> Checker<'a> {
         Checker { cloud, ..self }
     }
@@ -291,12 +295,9 @@ impl<'a> Checker<'a> {
 
     /// Adds the scene's objects that are not held.
     fn add_scene(&mut self, scene: &Scene) {
-        for object in &scene.objects {
-            // Held objects have been added with the arm; `hands` has the poses of the others.
-            if let Placement::World(pose) = &object.placement {
-                let part = Part::standing(&Geometry::from(&object.shape));
-                self.add_obstacle(object.name.clone(), None, pose.compose(&part.at), part, Entry::Pressed);
-            }
+        for Standing { name, pose, geometry } in crate::arm::objects(self.robot, scene) {
+            let part = Part::standing(&geometry);
+            self.add_obstacle(name, None, pose.compose(&part.at), part, Entry::Pressed);
         }
     }
 
@@ -517,7 +518,7 @@ impl<'a> Checker<'a> {
     }
 
     /// Sets the posture of the arm.
-    fn place(&mut self, arm: &JointVector) {
+    pub(crate) fn place(&mut self, arm: &JointVector) {
         self.configuration.arm = *arm;
         self.robot.update_arm(&self.configuration, &mut self.poses);
         for (i, moving) in self.moving.iter().enumerate() {
@@ -673,6 +674,7 @@ pub fn length(path: &[JointVector]) -> f64 {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+    use ratn_world::scene::Placement;
 
     /// A robot whose arm has the joints `a` and then `b`; the URDF in `joints` has what is between and behind them.
     fn robot(joints: &str, arm: &str, tool: &str) -> Robot {

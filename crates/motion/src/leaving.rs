@@ -12,7 +12,7 @@ use crate::collision::{Checker, Collision, Contact, Touch, between};
 use crate::joint_vector::JointVector;
 
 /// Tolerance for the growth of a penetration, in metres: rounding, and what nobody would call a contact.
-const GROWS_M: f64 = 5e-4;
+pub(crate) const GROWS_M: f64 = 5e-4;
 
 /// Contacts allowed with things not touched at the start: fingers and what they hold may be nearer than the padding, as before a departure.
 pub(crate) const NOTHING_NEW: Contact = Contact::Gripper(0.0);

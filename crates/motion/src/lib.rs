@@ -57,6 +57,7 @@ pub mod plan;
 mod ply;
 pub mod point_files;
 mod polygon;
+mod pressing;
 pub mod problems;
 pub mod reach;
 pub mod refine;

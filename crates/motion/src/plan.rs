@@ -5,7 +5,7 @@
 //! ```
 //!
 //! A goal is a list of alternatives, and a pose has many postures: every posture from which the approach is free is a candidate end of the free
-//! path. On straight parts, checked by exact shapes, the fingers and what they hold may touch their surroundings, the arm may not. The free path
+//! path. On straight parts, checked by exact shapes, the fingers and what they hold may touch what they touch at the start or the goal (`pressing`), the arm may not. The free path
 //! has no contact at all: it is searched with the vector checks, between postures that have room for them; if the start or a candidate has less
 //! room, a short way out of there comes first. If the tool is to stay upright, the free path keeps it so (`constrained`); the straight parts do
 //! anyway. If the tool is to move in straight lines, they replace the free path (`way_points`). If the gripper is inside an object at the start, a
@@ -32,7 +32,6 @@ use crate::simplify::path_length;
 use crate::space::{State, state};
 use arm_in_scene::ArmInScene;
 use candidates::Candidates;
-pub(crate) use contact::straight_collision;
 use departure::departure;
 pub use error::PlanError;
 use improvement::{Before, Improvement, Way};

@@ -100,7 +100,7 @@ pub fn validate_trajectory(
     contact: Contact,
 ) -> Result<Curve, Violation> {
     let trajectory = Curve::of_arm(robot, trajectory)?.counted_from(robot.arm_joints(), &here.arm);
-    check_start(robot, &here.arm, &trajectory)?;
+    check_start(robot, &here.arm, &trajectory, |_| START_TOLERANCE_RAD)?;
     check_rest(robot.arm_joints(), &trajectory)?;
     check_limits(robot.arm_joints(), &trajectory)?;
     let mut checker = Checker::new(robot, scene, here, 0.0);
@@ -108,11 +108,20 @@ pub fn validate_trajectory(
     Ok(trajectory)
 }
 
-fn check_start(robot: &Robot, start: &JointVector, trajectory: &Curve) -> Result<(), Violation> {
+/// Checks that a trajectory starts so near to the arm's position, per joint, in radians (metres for a prismatic joint).
+///
+/// # Errors
+/// [`Violation::Start`] names the first joint that is farther away.
+pub fn check_start(
+    robot: &Robot,
+    start: &JointVector,
+    trajectory: &Curve,
+    within: impl Fn(usize) -> f64,
+) -> Result<(), Violation> {
     let knots = trajectory.knots();
     for (j, joint) in robot.arm_joints().iter().enumerate() {
         let planned = knots[0].positions[j];
-        if (start[j] - planned).abs() > START_TOLERANCE_RAD {
+        if (start[j] - planned).abs() > within(j) {
             let unit = unit(robot.arm_slides()[j]);
             return Err(Violation::Start { joint: joint.name.clone(), actual: start[j], start: planned, unit });
         }

@@ -12,7 +12,8 @@ use crate::constrained::Constraint;
 use crate::joint_vector::JointVector;
 use crate::line::{Cause, Lines, Traced, trace};
 use crate::pace::{Pace, Stop};
-use crate::plan::{Goal, PlanError, Request, straight_collision};
+use crate::plan::{Goal, PlanError, Request};
+use crate::pressing::straight_collision;
 use crate::reach::Reach;
 use crate::space::state;
 use ratn_model::pose::Pose;
@@ -137,7 +138,7 @@ impl Follower<'_, '_> {
             return Ok(Ok(Followed { approach: vec![last], lines }));
         }
         let lines_in = Lines::new(entry, &[*goal], 0.0);
-        // The smallest depth is determined afterwards, along the resulting approach; deeper than the largest one is not allowed.
+        // What is pressed at the goal is determined afterwards, along the resulting approach; deeper than the largest one is not allowed.
         let contact = Contact::Gripper(self.presses_m.last().copied().unwrap_or_default());
         let (checker, mut leaving) = (&mut *self.checker, self.leaving.as_deref_mut());
         let is_free = &mut |from: &JointVector, to: &JointVector| {
@@ -169,10 +170,11 @@ impl Follower<'_, '_> {
 
     /// Tries the allowed depths in order; returns the collision of the approach if it is free at none of them.
     fn pressed(&mut self, approach: &[JointVector]) -> Option<String> {
+        let back: Vec<JointVector> = approach.iter().rev().copied().collect();
         let mut reason = None;
         for press_m in &self.presses_m {
-            let closed = straight_collision(self.checker, approach, *press_m).map(|c| c.to_string());
-            let open = self.leaving.as_deref_mut().and_then(|open| straight_collision(open, approach, *press_m));
+            let closed = straight_collision(self.checker, &back, *press_m).map(|c| c.to_string());
+            let open = self.leaving.as_deref_mut().and_then(|open| straight_collision(open, &back, *press_m));
             reason = closed.or(open.map(|collision| format!("leaving the goal with open fingers, {collision}")));
             if reason.is_none() {
                 break;

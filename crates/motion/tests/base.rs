@@ -187,6 +187,29 @@ fn what_stands_on_the_deck_rides_along_wherever_the_base_stands() {
 }
 
 #[test]
+fn what_reaches_over_the_deck_or_hangs_above_it_is_in_the_way() {
+    let rack = |size: [f64; 3], gap_m: f64| {
+        block("rack", Pose::at(-0.30, 0.0, aimm::DECK_HEIGHT_M + gap_m + size[2] / 2.0), size)
+    };
+    // A rack over the whole base, one that ends at its edges, and a box, which stands as exactly as it was measured.
+    for (size, gap_m, rides) in [
+        ([0.5, 1.6, 0.04], 0.025, false),
+        ([0.5, 1.6, 0.04], 0.0, false),
+        ([0.3, 0.3, 0.04], 0.025, false),
+        ([0.3, 0.3, 0.04], 0.005, true),
+        ([0.3, 0.3, 0.04], -0.005, true),
+    ] {
+        let scene = cell(Pose::IDENTITY, &[rack(size, gap_m)]);
+        let planned = planned(&scene, &to([-1.0, 0.0, 0.0]));
+        assert_eq!(riding(&Robot::aimm(), &scene), vec!["rack"; usize::from(rides)], "{size:?} {gap_m}");
+        match planned {
+            Ok(_) => assert!(rides, "{size:?} {gap_m}"),
+            Err(error) => assert!(!rides && matches!(error, DriveError::Start { .. }), "{size:?} {gap_m}: {error}"),
+        }
+    }
+}
+
+#[test]
 fn a_trajectory_of_the_arm_is_none_of_the_base() {
     let plan = planned(&cell(Pose::IDENTITY, &[]), &to([-1.0, 0.5, 0.3])).unwrap();
     let error = Curve::of(Robot::aimm().arm_joints(), &plan.trajectory).unwrap_err();

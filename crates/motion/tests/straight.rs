@@ -12,14 +12,15 @@ use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::arm;
-use ratn_motion::collision::{Checker, Contact};
+use ratn_motion::collision::{Checker, Collision, Contact};
 use ratn_motion::geometry::Geometry;
 use ratn_motion::joint_vector::JointVector;
+use ratn_motion::keep::Region;
 use ratn_motion::line::{Cause, line, line_of_nearest};
 use ratn_motion::pace::Control;
 use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
 use ratn_motion::reach::{Reach, Target};
-use ratn_motion::robot::{Joint, Robot};
+use ratn_motion::robot::{Configuration, Joint, Robot};
 use ratn_motion::straight::{Frame, Straight};
 use ratn_motion::timing::{Section, timed};
 use ratn_motion::trajectory::{Curve, Knot};
@@ -397,8 +398,8 @@ fn a_straight_part_that_makes_no_sense_is_refused_with_what_is_expected() {
 }
 
 #[test]
-fn a_departure_presses_no_neighbour_deeper_than_an_approach_would() {
-    // The fingers leave sideways, past a post that one of them presses by so much, but not at the start.
+fn a_departure_presses_no_neighbour_that_is_not_pressed_where_it_begins() {
+    // The fingers leave sideways, past a post that one of them presses by so much on its way, but not at the start.
     let leaves = |press_m: f64| {
         let mut cell = Cell::with_boxes(0, 1);
         cell.follow(&cell.plan(&request(cell.state(), vec![Goal::Joints(aimm::HOME)])).unwrap());
@@ -409,17 +410,126 @@ fn a_departure_presses_no_neighbour_deeper_than_an_approach_would() {
         let centre = tool.inverse().compose(&cell.robot.pose(&cell.state(), finger)).compose(&body.pose).position;
         let aside = centre[1] + centre[1].signum() * (half[1] + 0.015 - press_m);
         let place = Pose::at(centre[0] + half[0] + 0.05, aside, centre[2]);
-        cell.scene.objects.push(SceneObject {
-            name: "post".into(),
-            shape: Shape::Box { size: [0.03; 3] },
-            placement: Placement::World(tool.compose(&place)),
-        });
+        stand(&mut cell, "post", Shape::Box { size: [0.03; 3] }, tool.compose(&place));
         let mut exact = Checker::new(&cell.robot, &cell.scene, &cell.state(), 0.0);
         assert_eq!(exact.collision(&cell.arm, Contact::None), None);
         let depart = Straight { direction: [1.0, 0.0, 0.0], frame: Frame::Tool, length_m: 0.16 };
         cell.plan(&Request { depart, ..request(cell.state(), vec![Goal::Joints(aimm::OBSERVATION)]) })
     };
-    leaves(0.005).unwrap();
-    let refused = leaves(0.010).unwrap_err();
-    assert!(matches!(refused, PlanError::Depart { .. }) && refused.to_string().contains("post"), "{refused}");
+    leaves(-0.002).unwrap();
+    for press_m in [0.002, 0.005, 0.010] {
+        let Err(refused) = leaves(press_m) else { panic!("a post is pressed by {press_m} m") };
+        assert!(matches!(refused, PlanError::Depart { .. }) && refused.to_string().contains("post"), "{refused}");
+    }
+}
+
+fn stand(cell: &mut Cell, name: &str, shape: Shape, pose: Pose) {
+    cell.scene.objects.push(SceneObject { name: name.into(), shape, placement: Placement::World(pose) });
+}
+
+/// The arm at home above no table, with something in its fingers and something in its way, which is given in the frame of the tool.
+fn holding([held, at]: [(Shape, Pose); 2]) -> Cell {
+    let mut cell = Cell::with_boxes(0, 1);
+    cell.scene.objects.clear();
+    cell.arm = aimm::HOME;
+    let placement = Placement::Gripper(held.1);
+    cell.scene.objects.push(SceneObject { name: "held".into(), shape: held.0, placement });
+    let tool = cell.robot.tool_pose(&cell.state());
+    stand(&mut cell, "obstacle", at.0, tool.compose(&at.1));
+    cell
+}
+
+/// A departure from home of 0.1 m straight up, and an approach of 0.1 m down to it.
+fn up_and_down(cell: &Cell) -> [Result<Plan, PlanError>; 2] {
+    let up = Request { depart: Straight::up(0.1), ..request(cell.state(), vec![Goal::Joints(aimm::OBSERVATION)]) };
+    let from = Configuration { arm: aimm::OBSERVATION, ..cell.state() };
+    let down = Request { approach: Straight::down(0.1), ..request(from, vec![Goal::Joints(aimm::HOME)]) };
+    [up, down].map(|request| cell.plan(&request))
+}
+
+#[test]
+fn what_is_held_does_not_pass_through_a_thin_thing_on_a_straight_part() {
+    let pen = (Shape::Cylinder { radius: 0.004, length: 0.16 }, Pose::from_rpy([0.0; 3], 0.0, FRAC_PI_2, 0.0));
+    // A rod across the pen, and one that leads past its end.
+    for (aside_m, passes) in [(0.055, false), (0.09, true)] {
+        for radius in [0.0008, 0.0025, 0.0035] {
+            let across = Pose::from_rpy([aside_m, 0.0, -0.06], FRAC_PI_2, 0.0, 0.0);
+            let cell = holding([pen, (Shape::Cylinder { radius, length: 0.08 }, across)]);
+            for planned in up_and_down(&cell) {
+                let said = planned.as_ref().map_or_else(ToString::to_string, |_| String::new());
+                assert!(planned.is_ok() == passes && (passes || said.contains("obstacle")), "{radius}: {said}");
+            }
+        }
+    }
+}
+
+#[test]
+fn what_is_held_does_not_pass_a_shelf_that_covers_its_edge() {
+    let crate_ = (Shape::Box { size: [0.16, 0.07, 0.04] }, Pose::IDENTITY);
+    for (over_m, passes) in [(0.006, false), (0.002, false), (-0.003, true)] {
+        let shelf = Pose::at(over_m - 0.08 - 0.15, 0.0, -0.05);
+        let cell = holding([crate_, (Shape::Box { size: [0.30, 0.30, 0.02] }, shelf)]);
+        for planned in up_and_down(&cell) {
+            let said = planned.as_ref().map_or_else(ToString::to_string, |_| String::new());
+            assert!(planned.is_ok() == passes && (passes || said.contains("obstacle")), "{over_m}: {said}");
+        }
+    }
+}
+
+#[test]
+fn a_neighbour_that_is_pressed_at_the_goal_may_be_pressed_on_the_whole_straight_part() {
+    // In a row: what is held stands between two neighbours, and presses both.
+    let crate_ = (Shape::Box { size: [0.16, 0.07, 0.06] }, Pose::IDENTITY);
+    for press_m in [0.003, 0.006] {
+        let beside = |side: f64| Pose::at(side * (0.08 + 0.03 - press_m), 0.0, 0.0);
+        let block = Shape::Box { size: [0.06, 0.06, 0.06] };
+        let mut cell = holding([crate_, (block, beside(1.0))]);
+        let tool = cell.robot.tool_pose(&cell.state());
+        stand(&mut cell, "other", block, tool.compose(&beside(-1.0)));
+        for planned in up_and_down(&cell) {
+            planned.unwrap_or_else(|error| panic!("{press_m}: {error}"));
+        }
+    }
+}
+
+#[test]
+fn far_from_the_origin_nothing_changes() {
+    let moved = |by: &Pose, pose: &Pose| by.compose(pose);
+    let cell = |base: Pose| {
+        let mut cell = Cell::with_boxes(9, 3);
+        cell.scene.base = moved(&base, &cell.scene.base);
+        for object in &mut cell.scene.objects {
+            if let Placement::World(pose) = &mut object.placement {
+                *pose = moved(&base, pose);
+            }
+        }
+        let held = Placement::Gripper(Pose::IDENTITY);
+        let shape = Shape::Box { size: [0.16, 0.07, 0.10] };
+        cell.scene.objects.push(SceneObject { name: "held".into(), shape, placement: held });
+        cell
+    };
+    let region = |base: &Pose| Region { pose: moved(base, &Pose::at(0.5, 0.5, 0.9)), size: [0.3; 3] };
+    let (origin, away) = (Pose::IDENTITY, Pose::from_rpy([530_000.03, 180_000.02, 0.0], 0.0, 0.0, 0.7));
+    let (here, there) = (cell(origin), cell(away));
+    let mut near = Checker::new(&here.robot, &here.scene, &here.state(), 0.002).keeping_out_of(&[region(&origin)]);
+    let mut far = Checker::new(&there.robot, &there.scene, &there.state(), 0.002).keeping_out_of(&[region(&away)]);
+    let mut random = ChaCha8Rng::seed_from_u64(5);
+    let (mut free, mut met) = (0, 0);
+    for _ in 0..400 {
+        let arm = JointVector::from_fn(7, |j| {
+            here.robot.arm_joints()[j].clamp(aimm::OBSERVATION[j] + random.random_range(-0.5..0.5))
+        });
+        let [a, b] = [&mut near, &mut far].map(|checker| checker.collision(&arm, Contact::None));
+        let apart = |a: &Collision, b: &Collision| {
+            a.moving != b.moving || a.other != b.other || (a.depth_m - b.depth_m).abs() > 1e-5
+        };
+        let differs = match (&a, &b) {
+            (None, None) => false,
+            (Some(a), Some(b)) => apart(a, b),
+            _ => true,
+        };
+        assert!(!differs, "{a:?} {b:?}");
+        *if a.is_none() { &mut free } else { &mut met } += 1;
+    }
+    assert!(free > 50 && met > 50, "{free} {met}");
 }

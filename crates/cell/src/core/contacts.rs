@@ -3,12 +3,13 @@
 //! ```text
 //!                    ┌─ a finger at the object that it grasps next or has just released (Approach, Depart), or that it holds (Grasp)
 //! two bodies touch ──┼─ a held object above its support when the motion began (LiftOff), or where it is set down (SetDown)
-//!                    ├─ an object on a link that does not move (Stands); an object that a fault put there (PutThere)
+//!                    ├─ an object on a link that does not move, or moves along with it (Stands); an object that a fault put there (PutThere)
 //!                    └─ every other contact is unintended
 //! ```
 //! An episode begins when two bodies touch and ends when they have separated. Some episodes are judged later: a finger may brush the object that it
 //! grasps next, but an object that it brushed and did not close around was hit; and an object is set down on the body that it finally stands on. An
-//! intended contact has a bound as well: one deeper than [`PRESS_M`] is unintended.
+//! intended contact has a bound as well: one deeper than [`PRESS_M`] is unintended, and what is dragged further than that was neither lifted nor set
+//! down.
 
 use super::environment::{Environment, Thing, Touch};
 use ratn_model::time::Timestamp;
@@ -22,6 +23,8 @@ pub const TOLERANCE_M: f64 = 0.001;
 /// Maximum depth to which a held object may be pressed into the body that it is lifted from or set down on, and maximum distance by which a finger
 /// may push an object that it grasps or releases, in metres: poses are measured with an error of millimetres.
 pub const PRESS_M: f64 = 0.015;
+/// An object moves along with a link if its speed relative to it is no more than this, in metres per second.
+const ALONG_M_S: f64 = 0.05;
 /// A support is level if its normal has at least this upward component.
 const LEVEL: f64 = 0.7;
 /// Maximum number of stored contacts: the first ones.
@@ -62,7 +65,7 @@ pub enum Purpose {
     LiftOff,
     /// A released object comes to stand on this body. Another object counts as the support only if no furniture and no link supports it.
     SetDown,
-    /// An object stands on a link that the arm does not move.
+    /// An object stands on a link that does not move, or that moves along with it.
     Stands,
     /// A fault put the object there.
     PutThere,
@@ -72,10 +75,18 @@ pub enum Purpose {
 #[derive(Debug, Clone)]
 struct Episode {
     contact: Contact,
-    /// The object that is not held, and its position when the episode began.
+    /// The object that is not held, and its position when the episode began, or when it first overlapped with furniture.
     from: Option<(usize, [f64; 3])>,
+    dragged: Dragged,
     /// The upward component of the normal at the deepest point.
     up: f64,
+}
+
+/// How far a held object is dragged over something, horizontally, while it is deeper in that than [`TOLERANCE_M`].
+#[derive(Debug, Clone, Copy, Default)]
+struct Dragged {
+    from: Option<[f64; 3]>,
+    by_m: f64,
 }
 
 /// Watches a cell's contacts.
@@ -132,6 +143,8 @@ pub(super) struct Doing<'a> {
     pub(super) now: Timestamp,
     /// What each arm is doing, by arm number.
     pub(super) arms: &'a [ArmDoing],
+    /// The base moves.
+    pub(super) drives: bool,
 }
 
 /// What an arm and its gripper are doing in a step.
@@ -270,9 +283,10 @@ impl Contacts {
 
     /// The fingers of an arm have released an object, on purpose or not.
     pub(super) fn let_go(&mut self, arm: usize, object: usize, on_purpose: bool) {
-        for ([below, _], Episode { mut contact, up, .. }) in self.take(|things, _| things[1] == Thing::Object(object)) {
+        let of_object = |things: &[Thing; 2], _: &Episode| things[1] == Thing::Object(object);
+        for ([below, _], Episode { mut contact, up, dragged, .. }) in self.take(of_object) {
             // The normal points from the support to the held object.
-            if contact.meant.is_none() && on_purpose && up >= LEVEL {
+            if contact.meant.is_none() && on_purpose && up >= LEVEL && dragged.by_m <= PRESS_M {
                 contact.meant = Some(Purpose::SetDown);
                 self.settling.push((object, below, contact));
             } else {
@@ -349,17 +363,30 @@ impl Contacts {
                 speed_m_s: 0.0,
                 meant: self.known(touch, doing),
             };
-            let from = loose.map(|object| (object, environment.state(object).pose.position));
-            self.open.insert(touch.things.clone(), Episode { contact, from, up: 0.0 });
+            let from = loose.filter(|_| !is_fixed(touch)).map(|object| (object, position(environment, object)));
+            let dragged = Dragged::default();
+            self.open.insert(touch.things.clone(), Episode { contact, from, dragged, up: 0.0 });
         }
-        let Some(Episode { contact, from, up }) = self.open.get_mut(&touch.things) else { return };
+        let Some(Episode { contact, from, dragged, up }) = self.open.get_mut(&touch.things) else { return };
         if contact.meant == Some(Purpose::Stands) && is_moved(&self.arm_links, touch, doing) {
             // The link leaves with the object on it: from now on the link pushes.
             contact.meant = None;
-            *from = from.map(|(object, _)| (object, environment.state(object).pose.position));
+            *from = from.map(|(object, _)| (object, position(environment, object)));
             (contact.began, contact.depth_m, contact.pushed_m) = (doing.now, 0.0, 0.0);
         }
         if contact.meant == Some(Purpose::LiftOff) && is_pushed(&self.arm_links, touch, doing) {
+            contact.meant = None;
+            (contact.began, contact.depth_m, contact.pushed_m) = (doing.now, 0.0, 0.0);
+        }
+        if let Thing::Object(object) = touch.things[1] {
+            if doing.holder_of(object).is_some() {
+                dragged.see(touch, environment, object);
+            } else if is_fixed(touch) && from.is_none() && touch.depth_m > 0.0 {
+                // Aboard: the base drives it past furniture or against it.
+                *from = Some((object, position(environment, object)));
+            }
+        }
+        if contact.meant == Some(Purpose::LiftOff) && dragged.by_m > PRESS_M {
             contact.meant = None;
             (contact.began, contact.depth_m, contact.pushed_m) = (doing.now, 0.0, 0.0);
         }
@@ -373,8 +400,9 @@ impl Contacts {
         }
         if let Some((object, from)) = from
             && doing.holder_of(*object).is_none()
+            && (touch.depth_m > 0.0 || !is_fixed(touch))
         {
-            let at = environment.state(*object).pose.position;
+            let at = position(environment, *object);
             let pushed = (0..3).map(|i| (at[i] - from[i]).powi(2)).sum::<f64>().sqrt();
             contact.pushed_m = contact.pushed_m.max(pushed);
         }
@@ -401,7 +429,9 @@ impl Contacts {
                 Some(if leaves { Purpose::Depart } else { Purpose::Grasp })
             }
             [Thing::Link(_), Thing::Object(object)] if doing.holder_of(*object).is_none() => {
-                (touch.normal[2] >= LEVEL && !is_moved(&self.arm_links, touch, doing)).then_some(Purpose::Stands)
+                let is_moved = is_moved(&self.arm_links, touch, doing);
+                let goes_along = !doing.drives || touch.speed_m_s <= ALONG_M_S;
+                (touch.normal[2] >= LEVEL && !is_moved && goes_along).then_some(Purpose::Stands)
             }
             [_, Thing::Object(object)] => lifts(*object),
             _ => None,
@@ -450,6 +480,29 @@ impl Contacts {
             self.judged.push(contact);
         }
     }
+}
+
+impl Dragged {
+    /// A held object touches something: a link, which moves with the base, or something else.
+    fn see(&mut self, touch: &Touch, environment: &Environment, object: usize) {
+        if touch.depth_m <= TOLERANCE_M {
+            return;
+        }
+        let at = match touch.things[0] {
+            Thing::Link(_) => environment.position_on_base(object),
+            _ => position(environment, object),
+        };
+        let from = *self.from.get_or_insert(at);
+        self.by_m = self.by_m.max((at[0] - from[0]).hypot(at[1] - from[1]));
+    }
+}
+
+fn position(environment: &Environment, object: usize) -> [f64; 3] {
+    environment.state(object).pose.position
+}
+
+fn is_fixed(touch: &Touch) -> bool {
+    matches!(touch.things[0], Thing::Fixed(_))
 }
 
 /// Whether the touching body is a link of an arm that moves.
@@ -520,17 +573,29 @@ mod tests {
 
         /// One step in which the box is `x` metres from its first place and overlaps with a link by this depth, or with none.
         fn step(&mut self, x: f64, link: Option<(&str, f64)>, arm_moves: bool, fingers_solid: bool) {
+            self.step_beside(x, link.map(|link| (link, 0.1)), false, arm_moves, fingers_solid);
+        }
+
+        /// The same while the base drives or does not; the link is this fast.
+        fn step_beside(
+            &mut self,
+            x: f64,
+            link: Option<((&str, f64), f64)>,
+            drives: bool,
+            arm_moves: bool,
+            fingers_solid: bool,
+        ) {
             self.environment.put(0, &Pose::at(2.0 + x, 0.0, 0.5));
-            let touch = |(link, depth_m): (&str, f64)| Touch {
+            let touch = |((link, depth_m), speed_m_s): ((&str, f64), f64)| Touch {
                 things: [Thing::Link(link.to_owned()), Thing::Object(0)],
                 depth_m,
                 at: [2.0, 0.0, 0.45],
                 normal: [0.0, 0.0, 1.0],
-                speed_m_s: 0.1,
+                speed_m_s,
             };
             let touches: Vec<Touch> = link.map(touch).into_iter().collect();
             let arms = [ArmDoing { held: None, moves: arm_moves, is_moved: arm_moves, fingers_solid }];
-            let doing = Doing { now: Timestamp::default(), arms: &arms };
+            let doing = Doing { now: Timestamp::default(), arms: &arms, drives };
             self.contacts.observe(&touches, doing, &self.environment, &["box_1".to_owned()]);
         }
 
@@ -580,6 +645,47 @@ mod tests {
     }
 
     #[test]
+    fn what_a_base_drives_under_is_pushed_by_it_and_what_moves_along_with_it_stands_on_it() {
+        for (speed_m_s, expected) in [(0.3, &[20.0][..]), (0.01, &[])] {
+            let mut watched = Watched::new();
+            for x in [0.0, 0.02] {
+                watched.step_beside(x, Some((("base", 0.0004), speed_m_s)), true, false, true);
+            }
+            assert_eq!(watched.pushed_mm(), expected, "{speed_m_s} m/s");
+        }
+    }
+
+    #[test]
+    fn what_is_held_is_lifted_or_set_down_where_it_is_not_dragged() {
+        // The box is deep in the table, and then moves aside; it was there when it was grasped, or came from above.
+        for (lifts, aside_m, is_told) in
+            [(true, 0.01, false), (true, 0.2, true), (false, 0.01, false), (false, 0.2, true)]
+        {
+            let mut watched = Watched::new();
+            let mut step = |x: f64, is_moved: bool| {
+                watched.environment.put(0, &Pose::at(2.0 + x, 0.0, 0.5));
+                let touch = Touch {
+                    things: [Thing::Fixed("table".to_owned()), Thing::Object(0)],
+                    depth_m: 0.005,
+                    at: [2.0, 0.0, 0.45],
+                    normal: [0.0, 0.0, 1.0],
+                    speed_m_s: 0.1,
+                };
+                let arms = [ArmDoing { held: Some(0), moves: is_moved, is_moved, fingers_solid: true }];
+                let doing = Doing { now: Timestamp::default(), arms: &arms, drives: false };
+                watched.contacts.observe(&[touch], doing, &watched.environment, &["box_1".to_owned()]);
+            };
+            step(0.0, !lifts);
+            (1..=10).for_each(|i| step(aside_m * f64::from(i) / 10.0, true));
+            if !lifts {
+                watched.contacts.let_go(0, 0, true);
+            }
+            let found = watched.contacts.unintended();
+            assert_eq!(!found.is_empty(), is_told, "{lifts} {aside_m}: {found:?}");
+        }
+    }
+
+    #[test]
     fn a_grasp_in_vain_excuses_the_fingers_until_the_next_motion_sets_out() {
         for (moves, excused) in [(false, true), (true, false)] {
             let mut watched = Watched::new();
@@ -609,10 +715,10 @@ mod tests {
         let doing = |is_moved| [ArmDoing { held: Some(0), moves: false, is_moved, fingers_solid: true }];
         watched.contacts.closed(0, Some(0), &watched.environment);
         for (depth_m, moves) in [(0.0004, false), (0.006, true)] {
-            let doing = Doing { now: Timestamp::default(), arms: &doing(moves) };
+            let doing = Doing { now: Timestamp::default(), arms: &doing(moves), drives: false };
             watched.contacts.observe(&[touch(depth_m)], doing, &watched.environment, &["box_1".to_owned()]);
         }
-        let doing = Doing { now: Timestamp::default(), arms: &doing(true) };
+        let doing = Doing { now: Timestamp::default(), arms: &doing(true), drives: false };
         watched.contacts.observe(&[], doing, &watched.environment, &["box_1".to_owned()]);
         watched.contacts.unintended()
     }
@@ -646,7 +752,7 @@ mod tests {
                 speed_m_s: 0.1,
             };
             let mut unintended_while = |other: ArmDoing| {
-                let doing = Doing { now: Timestamp::default(), arms: &[holds, other] };
+                let doing = Doing { now: Timestamp::default(), arms: &[holds, other], drives: false };
                 let ids = ["box_1".to_owned(), "box_2".to_owned()];
                 contacts.observe(std::slice::from_ref(&touch), doing, &watched.environment, &ids);
                 contacts.unintended().len()

@@ -63,7 +63,7 @@ impl Cell {
             ArmDoing { held, moves, is_moved: moves || drives, fingers_solid: *solid }
         });
         let arms: Vec<ArmDoing> = doing.collect();
-        let doing = Doing { now: self.environment.now(), arms: &arms };
+        let doing = Doing { now: self.environment.now(), arms: &arms, drives };
         self.contacts.observe(&self.environment.touches(), doing, &self.environment, &self.ids);
         is_lost
     }

@@ -211,9 +211,10 @@ impl Cell {
         let robot = self.arms.view(arm);
         let as_they_are = self.arms.seen_from(arm, here);
         let open = self.arms.seen_from(arm, &self.arms.with_others_open(arm, here));
-        let checked = trajectory::check(robot, &as_they_are, trajectory)?;
+        let stiffness = self.config.controllers.arm_stiffness;
+        let checked = trajectory::check(robot, &as_they_are, trajectory, stiffness)?;
         if open != as_they_are {
-            trajectory::check(robot, &open, trajectory)?;
+            trajectory::check(robot, &open, trajectory, stiffness)?;
         }
         Ok(checked)
     }

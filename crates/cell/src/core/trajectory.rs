@@ -11,20 +11,29 @@ use ratn_motion::plan::MIN_SPEED;
 use ratn_motion::robot::{Configuration, Robot};
 use ratn_motion::timing::{Section, parameterise};
 use ratn_motion::trajectory::Curve;
-use ratn_motion::validate::validate_trajectory;
+use ratn_motion::validate::{Violation, check_start, validate_trajectory};
 use ratn_world::scene::Scene;
 
 /// Maximum duration of a motion, in seconds: every posture is checked before it begins.
 const MAX_MOTION_S: f64 = 600.0;
 
-/// The trajectory, ready to be followed from the measured configuration `here`.
+/// The trajectory, ready to be followed from the measured configuration `here` by a controller of this stiffness, in radians per second.
 ///
 /// # Errors
 /// Why it may not be followed.
-pub(crate) fn check(robot: &Robot, here: &Configuration, trajectory: &Trajectory) -> Result<Curve, String> {
+pub(crate) fn check(
+    robot: &Robot,
+    here: &Configuration,
+    trajectory: &Trajectory,
+    stiffness: f64,
+) -> Result<Curve, String> {
     is_short(trajectory)?;
-    validate_trajectory(robot, &nothing(), here, trajectory, Contact::None)
-        .map_err(|violation| format!("the trajectory is refused: {violation}"))
+    let refused = |violation: Violation| format!("the trajectory is refused: {violation}");
+    let curve = validate_trajectory(robot, &nothing(), here, trajectory, Contact::None).map_err(refused)?;
+    // The controller brings a joint to where the trajectory starts with an acceleration of its own.
+    let within = |joint: usize| robot.arm_joints()[joint].acceleration / stiffness.powi(2);
+    check_start(robot, &here.arm, &curve, within).map_err(refused)?;
+    Ok(curve)
 }
 
 /// The same for the base.

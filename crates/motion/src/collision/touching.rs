@@ -1,12 +1,13 @@
-//! Contacts of the gripper: what of it is inside an object in a posture, how deep, and the shortest way out.
+//! Contacts of the gripper: what of it is inside something in a posture, how deep, and the shortest way out.
 //!
-//! An arm that stands in contact has to be able to leave it (`leaving`). This file finds the contacts; it does not decide which are allowed. Only
-//! contacts of the hand, the fingers and what they hold with objects of the scene count: never the other links of the arm, the robot itself, a box
-//! to keep out of, or a cloud.
+//! This file finds the contacts; it does not decide which are allowed. An arm that stands in contact has to be able to leave it (`leaving`): of the
+//! hand, the fingers and what they hold with objects of the scene, never of the other links of the arm, nor with the robot itself, a box to keep
+//! out of, or a cloud. On straight parts the fingers and what they hold may press whatever they touch at the contact end (`pressing`).
 
 use super::{Checker, Collision, Entry, Other, Role};
 use crate::distance;
 use crate::joint_vector::JointVector;
+use crate::validate::RESOLUTION_M;
 
 /// A part of the gripper that is inside an object.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -20,15 +21,72 @@ pub(crate) struct Touch {
     pub(crate) depth_m: f64,
 }
 
+/// Something that fingers, or what they hold, may press.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Against {
+    /// An obstacle, by its index in the checker.
+    Obstacle(usize),
+    /// A ball of the cloud.
+    Ball(usize),
+}
+
 impl<'a> Checker<'a> {
+    /// What fingers, and what they hold, are in in the posture checked last, and how deep, in metres, without any padding. Fingers are in no hollow
+    /// object.
+    pub(crate) fn presses(&self) -> Vec<((usize, Against), f64)> {
+        let mut presses = Vec::new();
+        for i in (0..self.moving.len()).filter(|i| self.can_press(*i)) {
+            for &o in self.moving[i].obstacles.iter().filter(|o| !self.is_in_hollow(i, **o)) {
+                let depth_m = self.depth_in(i, o);
+                if depth_m > 0.0 {
+                    presses.push(((i, Against::Obstacle(o)), depth_m));
+                }
+            }
+            let Some(cloud) = &self.cloud else { continue };
+            let (solid, radius) = (&self.moving[i].solid, cloud.radius_m() as f32);
+            cloud.visit_near(&self.placed[i], &solid.shape, solid.inside.as_deref(), radius, &mut |ball, gap| {
+                presses.push(((i, Against::Ball(ball)), f64::from(radius - gap)));
+                true
+            });
+        }
+        presses
+    }
+
+    /// The contact of a moving shape, at this depth, as it is reported in messages.
+    pub(crate) fn pressed(&self, (i, against): (usize, Against), depth_m: f64) -> Collision {
+        let other = match against {
+            Against::Obstacle(o) => self.obstacles[o].name.clone(),
+            Against::Ball(_) => self.cloud.as_ref().map(|cloud| cloud.name.clone()).unwrap_or_default(),
+        };
+        Collision { moving: self.moving[i].name.clone(), other, depth_m, padding_m: 0.0 }
+    }
+
+    /// Number of equal steps into which the motion between two close postures must be cut so that in one step no shape that may press something
+    /// near it moves further than [`RESOLUTION_M`]; 1 where nothing is near. The second posture is the one checked last.
+    pub(crate) fn steps_of_presses(&mut self, from: &JointVector, to: &JointVector) -> usize {
+        self.place(from);
+        let before = self.placed.clone();
+        self.place(to);
+        let mut steps = 1;
+        for i in (0..self.moving.len()).filter(|i| self.can_press(*i)) {
+            let (was, moving) = (before[i].transform_point(self.moving[i].middle), &self.moving[i]);
+            let turned = 2.0 * (before[i].rotation.inverse() * self.placed[i].rotation).xyz().length();
+            let moves_m = f64::from((self.centres[i] - was).length() + turned * moving.radius);
+            let is_near =
+                |o: &usize| self.is_within(i, *o, moves_m) && self.apart_m(i, Other::Obstacle(*o), moves_m) < moves_m;
+            if moving.obstacles.iter().any(is_near) || self.gap_to_cloud(i, moves_m) < moves_m {
+                steps = steps.max((moves_m / RESOLUTION_M).ceil() as usize);
+            }
+        }
+        steps
+    }
+
     /// All parts of the gripper that are inside an object in a posture.
     pub(crate) fn touches(&mut self, arm: &JointVector) -> Vec<Touch> {
         self.place(arm);
         let mut touches = Vec::new();
         for (i, moving) in self.moving.iter().enumerate().filter(|(_, moving)| moving.role != Role::Arm) {
-            // Fingers in a hollow object are in its filled shape, and touch nothing.
-            let is_in_hollow = |o: usize| moving.role == Role::Finger && self.obstacles[o].entry == Entry::Open;
-            for &o in moving.obstacles.iter().filter(|o| self.is_object(**o) && !is_in_hollow(**o)) {
+            for &o in moving.obstacles.iter().filter(|o| self.is_object(**o) && !self.is_in_hollow(i, **o)) {
                 let depth_m = self.depth_in(i, o);
                 if depth_m > 0.0 {
                     touches.push(Touch { moving: i, obstacle: o, is_held: moving.role == Role::Held, depth_m });
@@ -57,14 +115,13 @@ impl<'a> Checker<'a> {
     pub(crate) fn way_out(&self, touch: &Touch) -> Option<[f64; 3]> {
         let (moving, obstacle) = (&self.moving[touch.moving], &self.obstacles[touch.obstacle]);
         let (own, other) = (&self.placed[touch.moving], &obstacle.pose);
-        distance::way_out(own, &*moving.solid.shape, other, &*obstacle.solid.shape)
+        let way = distance::way_out(own, &*moving.solid.shape, other, &*obstacle.solid.shape)?;
+        Some(self.base.rotate(way))
     }
 
     /// The touch, at this depth, as it is reported in messages.
     pub(crate) fn told(&self, touch: &Touch, depth_m: f64) -> Collision {
-        let (moving, other) = (&self.moving[touch.moving].name, &self.obstacles[touch.obstacle].name);
-        let (moving, other) = (moving.clone(), other.clone());
-        Collision { moving, other, depth_m, padding_m: 0.0 }
+        self.pressed((touch.moving, Against::Obstacle(touch.obstacle)), depth_m)
     }
 
     /// Whether an obstacle is an object of the scene that may be touched.
@@ -72,10 +129,20 @@ impl<'a> Checker<'a> {
         self.obstacles[o].link.is_none() && self.obstacles[o].entry != Entry::Never
     }
 
+    /// Whether this is a finger beside a hollow object: it may be in the filled shape of that, and touches nothing.
+    fn is_in_hollow(&self, i: usize, o: usize) -> bool {
+        self.moving[i].role == Role::Finger && self.obstacles[o].entry == Entry::Open
+    }
+
+    /// Whether the bounding spheres are nearer to each other than `within_m` metres in the posture checked last.
+    fn is_within(&self, i: usize, o: usize, within_m: f64) -> bool {
+        let reach = self.moving[i].radius + self.obstacles[o].radius + within_m as f32;
+        self.centres[i].distance_squared(self.obstacles[o].centre) < reach * reach
+    }
+
     /// Penetration in the posture checked last.
     fn depth_in(&self, i: usize, o: usize) -> f64 {
-        let reach = self.moving[i].radius + self.obstacles[o].radius;
-        if self.centres[i].distance_squared(self.obstacles[o].centre) >= reach * reach {
+        if !self.is_within(i, o, 0.0) {
             return 0.0;
         }
         (-self.apart_m(i, Other::Obstacle(o), 0.0)).max(0.0)

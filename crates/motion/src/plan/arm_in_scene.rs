@@ -17,6 +17,7 @@ use crate::ladder;
 use crate::leaving::{Leaving, NOTHING_NEW};
 use crate::line::{self, Cause, LineError, Lines};
 use crate::pace::{Pace, Stop};
+use crate::pressing::{Pressing, straight_collision};
 use crate::reach::{Postures, Reach, Target};
 use crate::refine::{End, Measure, Refinement};
 use crate::request::{Request, kept_out};
@@ -80,7 +81,7 @@ pub(super) struct ArmInScene<'a> {
     search: Search<'a>,
     /// The couples that the vector checks leave out, checked by exact shapes: pairs of links, and links with obstacles.
     unseen: [Option<Checker<'a>>; 2],
-    /// Points that a camera saw and that belong to no known object, in the world frame.
+    /// Points that a camera saw and that belong to no known object, in the frame of the base.
     seen: Option<Arc<Cloud>>,
     /// The kinematics of the tool in the frame of the base, which is at `base`.
     reach: Reach,
@@ -102,7 +103,8 @@ impl<'a> ArmInScene<'a> {
             geometry: Geometry::from(&Shape::Box { size: region.size }),
         }));
         let seen = request.seen.as_ref().map(|seen| seen.unknown(robot, scene, &here)).transpose()?;
-        let clouds = seen.as_ref().map(|cloud| cloud.moved(&base.inverse())).transpose()?;
+        let seen = seen.map(|cloud| cloud.moved(&base.inverse())).transpose()?;
+        let clouds = seen.clone();
         let seen = seen.map(Arc::new);
         let search = Search::new(robot, arm::from_base(robot, scene, &here), around, clouds.into_iter().collect());
         let mut arm = ArmInScene {
@@ -186,13 +188,13 @@ impl<'a> ArmInScene<'a> {
         self.checker.edge_collision(from, to, Contact::None)
     }
 
-    /// The first forbidden contact on a straight part.
+    /// The first forbidden contact on a straight part, whose postures begin at its contact end.
     pub(super) fn straight_collision(&mut self, postures: &[JointVector], press_m: f64) -> Option<Collision> {
-        contact::straight_collision(&mut self.checker, postures, press_m)
+        straight_collision(&mut self.checker, postures, press_m)
     }
 
-    /// Postures along a straight part that begins in `from`, where the fingers and what they hold may penetrate by `press_m`; or why it ends
-    /// early. An arm with a redundant joint moves its elbow around obstacles.
+    /// Postures along a straight part that begins in `from`, where the fingers and what they hold may penetrate by `press_m` and on the way no
+    /// deeper; or why it ends early. An arm with a redundant joint moves its elbow around obstacles.
     pub(super) fn leave(
         &mut self,
         from: &JointVector,
@@ -200,14 +202,15 @@ impl<'a> ArmInScene<'a> {
         press_m: f64,
         pace: &mut Pace<'_>,
     ) -> Result<Result<Vec<JointVector>, String>, Stop> {
-        if let Some(collision) = self.collision(from, Contact::Gripper(press_m)) {
-            return Ok(Err(collision.to_string()));
-        }
+        let begins = match Pressing::at(&mut self.checker, from, press_m) {
+            Ok(begins) => begins,
+            Err(collision) => return Ok(Err(collision.to_string())),
+        };
         let to = arm::moved(&self.reach, from, self.way(part, from));
         let lines = Lines::new(self.reach.pose(from), &[to], 0.0);
-        let (checker, reach, mut met) = (&mut self.checker, &self.reach, None);
+        let (checker, reach, mut met, mut pressing) = (&mut self.checker, &self.reach, None, begins.clone());
         let is_free = &mut |from: &JointVector, to: &JointVector| {
-            met = checker.edge_collision(from, to, Contact::Gripper(press_m));
+            met = pressing.goes(checker, from, to).err();
             met.as_ref().map_or(Ok(()), |collision| Err(collision.to_string()))
         };
         let mut traced = line::nearest(reach, &lines, from, is_free, &mut || pace.answer())?;
@@ -217,8 +220,15 @@ impl<'a> ArmInScene<'a> {
             let checker = &mut self.checker;
             let is_free =
                 &mut |from: &JointVector, to: &JointVector| checker.edge_is_free(from, to, Contact::Gripper(press_m));
-            let other = ladder::climb(reach, &lines, from, is_free, &mut || pace.answer())?;
-            traced = other.unwrap_or(traced);
+            if let Some(other) = ladder::climb(reach, &lines, from, is_free, &mut || pace.answer())? {
+                // What is pressed depends on the way there.
+                let mut pressing = begins;
+                let goes = |pair: &[JointVector]| pressing.goes(checker, &pair[0], &pair[1]);
+                if let Err(collision) = other.postures.windows(2).try_for_each(goes) {
+                    return Ok(Err(collision.to_string()));
+                }
+                traced = other;
+            }
         }
         Ok(match traced.ended {
             Some(Cause::Blocked { reason }) => Err(reason),

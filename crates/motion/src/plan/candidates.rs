@@ -1,11 +1,12 @@
 //! Candidates for the end of the free path: every posture at a goal from which the approach is free, with that approach.
 
 use super::arm_in_scene::ArmInScene;
-use super::contact::{presses_m, straight_collision};
+use super::contact::presses_m;
 use super::error::{MAX_REASONS, PlanError};
 use crate::collision::{Checker, Contact, distance, length};
 use crate::joint_vector::JointVector;
 use crate::pace::{Pace, Stop};
+use crate::pressing::straight_collision;
 use crate::reach::is_new;
 use crate::refine::End;
 use crate::request::Goal;
@@ -60,7 +61,7 @@ pub(super) enum Refusal {
 
 /// The candidates of one request; their indices do not change.
 pub(super) struct Candidates<'a> {
-    /// Allowed penetration of an approach, in metres.
+    /// Allowed penetration at the goal of an approach, in metres.
     press_m: f64,
     /// The checker for leaving a goal where the tool releases what it holds.
     leaving: Option<Checker<'a>>,

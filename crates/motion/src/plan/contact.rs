@@ -1,7 +1,5 @@
 //! What may touch what on the straight parts next to start and goal.
 
-use crate::collision::{Checker, Collision, Contact};
-use crate::joint_vector::JointVector;
 use crate::robot::Robot;
 use ratn_world::scene::{Placement, Scene, SceneObject};
 
@@ -11,18 +9,7 @@ const MEASURED_WITHIN_M: f64 = 0.002;
 /// Number of steps from touching to the deepest penetration allowed; of the ways to a goal those with the smallest penetration are used.
 const PRESS_STEPS: u32 = 4;
 
-/// The first forbidden contact on a straight part.
-pub(crate) fn straight_collision(
-    checker: &mut Checker<'_>,
-    postures: &[JointVector],
-    press_m: f64,
-) -> Option<Collision> {
-    let contact = Contact::Gripper(press_m);
-    let first = checker.collision(&postures[0], contact);
-    first.or_else(|| postures.windows(2).find_map(|w| checker.edge_collision(&w[0], &w[1], contact)))
-}
-
-/// Allowed penetrations of the fingers and what they hold on the way to a goal, in metres, in the order in which they are tried; negative: a
+/// Allowed penetrations of the fingers and what they hold at a goal, in metres, in the order in which they are tried; negative: a
 /// distance to keep. The greatest is half a finger's thickness: a finger that comes down beside an edge pushes it aside, and one that comes down
 /// with more than half of its thickness on it stands on it.
 pub(super) fn presses_m(robot: &Robot) -> Vec<f64> {
@@ -31,7 +18,7 @@ pub(super) fn presses_m(robot: &Robot) -> Vec<f64> {
 }
 
 /// Half of a finger's thickness along its closing direction, in metres; 0 for a robot without fingers.
-pub(super) fn half_finger_m(robot: &Robot) -> f64 {
+fn half_finger_m(robot: &Robot) -> f64 {
     robot.finger_parts().iter().map(|part| part.half[1]).fold(0.0, f64::max)
 }
 

@@ -1,7 +1,6 @@
 //! The straight part at the start.
 
 use super::arm_in_scene::{ArmInScene, PADDINGS_M};
-use super::contact::half_finger_m;
 use super::error::PlanError;
 use super::retreat::retreat;
 use crate::collision::{CONTACT_TOLERANCE_M, Contact};
@@ -57,11 +56,7 @@ fn padded_departure(arm: &mut ArmInScene<'_>, pace: &mut Pace<'_>) -> Result<Vec
         };
     }
     let failed = |reason: String| PlanError::Depart { part: part.to_string(), reason };
-    // Checked with the greatest penetration allowed: as on an approach, or more if the start is deeper already.
-    let usual_m = half_finger_m(arm.robot());
-    let is_deep = arm.collision(&start, Contact::Gripper(usual_m)).is_some();
-    let press_m = if is_deep { CONTACT_TOLERANCE_M } else { usual_m };
-    let postures = arm.leave(&start, part, press_m, pace)?.map_err(failed)?;
+    let postures = arm.leave(&start, part, CONTACT_TOLERANCE_M, pace)?.map_err(failed)?;
     match arm.collision(&postures[postures.len() - 1], Contact::None) {
         Some(collision) => Err(failed(format!("at its end {collision}"))),
         None => Ok(postures),

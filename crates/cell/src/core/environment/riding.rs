@@ -158,6 +158,6 @@ fn holds(model: &Model, pose: &Pose, acceleration: f64) -> bool {
     axes[up] >= MAX_LEAN_RAD.cos() && acceleration <= bears
 }
 
-fn base_pose([x, y, heading]: [f64; 3]) -> Pose {
+pub(super) fn base_pose([x, y, heading]: [f64; 3]) -> Pose {
     Pose::from_rpy([x, y, 0.0], 0.0, 0.0, heading)
 }

@@ -326,20 +326,54 @@ fn convex(shape: &dyn Shape, place: &Pose32) -> Convex {
 }
 
 impl Environment {
-    /// All contacts after the last step: of links and carried objects with anything else, without the pairs that the robot is built to have in
-    /// contact. Of two bodies only the deepest contact.
+    /// All contacts after the last step: of links and carried objects with anything else, and of objects aboard a driving base with everything that
+    /// does not drive along, without the pairs that the robot is built to have in contact. Of two bodies only the deepest contact.
     pub fn touches(&self) -> Vec<Touch> {
         let groups = self.groups();
+        let mut found = self.met(self.candidates(&groups));
+        let mut aboard = BTreeSet::new();
+        // What stands on something aboard is found one after the other.
+        loop {
+            let boards = |object: &usize| !aboard.contains(object) && self.is_aboard(*object, &found, &aboard);
+            let more: BTreeSet<usize> = (0..self.len()).filter(boards).collect();
+            if more.is_empty() {
+                break;
+            }
+            aboard.extend(&more);
+            found.extend(self.met(self.candidates_aboard(&groups, &more, &aboard)));
+        }
+        let is_aboard = |thing: &Thing| matches!(thing, Thing::Object(object) if aboard.contains(object));
+        found.retain(|touch| !touch.things.iter().all(is_aboard));
+        deepest(found)
+    }
+
+    /// Whether an object goes where the base drives: it rides, or stands on the robot or on something aboard.
+    fn is_aboard(&self, object: usize, found: &[Touch], aboard: &BTreeSet<usize>) -> bool {
+        let stands = |touch: &Touch| match touch.things {
+            [Thing::Link(_), Thing::Object(above)] => above == object && touch.normal[2] >= LEVEL,
+            [Thing::Object(above), Thing::Object(below)] => {
+                above == object && aboard.contains(&below) && touch.normal[2] <= -LEVEL
+            }
+            _ => false,
+        };
+        if !self.drives || self.state(object).carried {
+            return false;
+        }
+        self.riding.seat(object).is_some() || found.iter().any(stands)
+    }
+
+    /// The contacts of these pairs. Several of two things may be found; the last one is the deepest.
+    fn met(&self, candidates: Vec<Candidate<'_, '_>>) -> Vec<Touch> {
         let mut found: Vec<Touch> = Vec::new();
         let mut deepest_yet: Option<([Of<'_>; 2], f64)> = None;
-        for Candidate { of, parts: [a, b] } in self.candidates(&groups) {
+        for Candidate { of, parts: [a, b] } in candidates {
             // Only the deepest contact of two things counts: a contact less deep than one already found need not be computed.
             let within_m = deepest_yet.filter(|(of_it, _)| *of_it == of).map_or(NEAR_M, |(_, depth_m)| -depth_m);
             let Some(touch) = a.aabb.intersects(&b.aabb).then(|| touch(a, b, within_m)).flatten() else { continue };
             deepest_yet = Some((of, touch.depth_m));
             found.push(Touch { things: of.map(|of| self.thing(of)), ..touch });
         }
-        deepest(found)
+        found
     }
 
     fn thing(&self, of: Of<'_>) -> Thing {
@@ -362,13 +396,8 @@ impl Environment {
     /// The pairs of colliders that have to be checked.
     fn candidates<'g, 'a>(&'a self, groups: &'g Groups<'a>) -> Vec<Candidate<'g, 'a>> {
         let mut found = Vec::new();
-        // Iterates over the parts of the first thing; with `turned` the second thing is the first of each pair.
         let mut look = |first: &'g Group<'a>, second: &'g Group<'a>, turned: bool| {
-            let candidate = |[a, b]: [&'g Part<'a>; 2]| match turned {
-                true => Candidate { of: [second.of, first.of], parts: [b, a] },
-                false => Candidate { of: [first.of, second.of], parts: [a, b] },
-            };
-            found.extend(first.pairs(second).map(candidate));
+            found.extend(candidates_of(first, second, turned));
         };
         let Groups { links, fixed, objects } = groups;
         for [a, b] in &self.joined().apart {
@@ -388,6 +417,21 @@ impl Environment {
             fixed.iter().chain(others).for_each(|other| look(carried, other, true));
         }
         found
+    }
+
+    /// The pairs of colliders of objects aboard and of what is not aboard. Carried objects and links are among the other candidates.
+    fn candidates_aboard<'g, 'a>(
+        &'a self,
+        groups: &'g Groups<'a>,
+        of: &BTreeSet<usize>,
+        aboard: &BTreeSet<usize>,
+    ) -> Vec<Candidate<'g, 'a>> {
+        let Groups { fixed, objects, .. } = groups;
+        let is_in = |group: &&Group<'_>, set: &BTreeSet<usize>| matches!(group.of, Of::Object(o) if set.contains(&o));
+        let is_carried = |group: &&Group<'_>| matches!(group.of, Of::Object(o) if self.state(o).carried);
+        let others = || objects.iter().filter(|other| !is_in(other, aboard) && !is_carried(other));
+        let boarded = objects.iter().filter(|object| is_in(object, of));
+        boarded.flat_map(|one| fixed.iter().chain(others()).flat_map(|other| candidates_of(one, other, true))).collect()
     }
 
     /// The supports of an object: everything that touches it from below.
@@ -456,6 +500,19 @@ impl Environment {
         let aabb = collider.shape().compute_aabb(&place).loosened(NEAR_M as f32);
         Part { form: Form::Convex(convex(collider.shape(), &place)), speed, aabb }
     }
+}
+
+/// The pairs of colliders of two things that may touch, in the order of the parts of the first; with `turned` the second thing is the first of each
+/// pair.
+fn candidates_of<'g, 'a>(
+    first: &'g Group<'a>,
+    second: &'g Group<'a>,
+    turned: bool,
+) -> impl Iterator<Item = Candidate<'g, 'a>> {
+    first.pairs(second).map(move |[a, b]| match turned {
+        true => Candidate { of: [second.of, first.of], parts: [b, a] },
+        false => Candidate { of: [first.of, second.of], parts: [a, b] },
+    })
 }
 
 /// Depth of a thing in the support below it; `None` if the support does not bear it.

@@ -1,7 +1,7 @@
 //! The rigid bodies and the simulation step.
 
 use super::object::{Kind, Model};
-use super::riding::Riding;
+use super::riding::{Riding, base_pose};
 use super::touch::{Joined, Speed};
 use rapier3d::math::{Pose as Pose32, Vector};
 use rapier3d::prelude::{
@@ -102,6 +102,8 @@ pub struct Environment {
     links: Vec<RobotBody>,
     /// Position of the robot's base at the last step.
     pub(super) base: [f64; 3],
+    /// Whether the base moved in the last step.
+    pub(super) drives: bool,
     /// Per arm: whether the fingers of its gripper push what they touch.
     fingers_solid: Vec<bool>,
     objects: Vec<Body>,
@@ -199,6 +201,7 @@ impl Environment {
             standing: Vec::new(),
             links: Vec::new(),
             base: configuration.base,
+            drives: false,
             fingers_solid: vec![true; robot.arm_names().count()],
             objects: Vec::new(),
             riding: Riding::restored(riders(saved)),
@@ -265,8 +268,9 @@ impl Environment {
     pub fn step(&mut self, robot: &Robot, configuration: &Configuration) {
         self.take_along(robot, configuration);
         let before = std::mem::replace(&mut self.base, configuration.base);
+        self.drives = before != configuration.base;
         // A contact recycled from the step before has its points where the carrier was then: on a turning deck, objects would creep outwards.
-        self.parameters.contact_recycling = before == configuration.base;
+        self.parameters.contact_recycling = !self.drives;
         let poses = robot.poses(configuration);
         for link in &mut self.links {
             let (body, pose) = (&mut self.bodies[link.body], to_f32(&poses[link.link].compose(&link.pose)));
@@ -314,6 +318,11 @@ impl Environment {
             carried: body.is_kinematic() && rides.is_none(),
             rides,
         }
+    }
+
+    /// Position of an object in the frame of the base.
+    pub fn position_on_base(&self, object: usize) -> [f64; 3] {
+        base_pose(self.base).inverse().transform(self.state(object).pose.position)
     }
 
     /// The model of an object.
