@@ -236,6 +236,28 @@ fn a_head_does_not_turn_into_the_way_of_an_arm_nor_into_one_that_stands() {
 }
 
 #[test]
+fn a_head_does_not_turn_into_a_link_of_its_own_robot_that_no_arm_moves() {
+    // A mast where the stick comes to when it has turned by 2 rad.
+    let mast = format!(
+        "<link name='mast'><collision><geometry><box size='0.02 0.02 0.4'/></geometry></collision></link>\
+         <joint name='mast' type='fixed'><parent link='world'/><child link='mast'/><origin xyz='{} {} 1.5'/></joint>",
+        0.6 + 0.4 * 2.0_f64.cos(),
+        0.4 * 2.0_f64.sin()
+    );
+    let (mut bench, _folder) = with_head_and("world", &mast);
+    goes(&mut bench, LEFT, ASIDE);
+    let reason = refused(&mut bench, LEFT, look(ROUND));
+    assert!(
+        reason.starts_with("the head stays where it is: head of the head comes nearer than 3 mm to mast"),
+        "{reason}"
+    );
+    // As far as there is room, and away again.
+    bench.done(look(1.9));
+    bench.done(look(SHORT));
+    assert_eq!(bench.cell.unintended_contacts(), []);
+}
+
+#[test]
 fn an_arm_does_not_set_out_into_the_way_of_a_head_that_turns() {
     let (mut bench, _folder) = with_head("world");
     goes(&mut bench, LEFT, ASIDE);

@@ -19,6 +19,7 @@ mod link;
 pub mod metrics;
 mod paging;
 pub mod process_manager;
+pub mod processor_demand;
 pub mod quota;
 pub mod reload;
 pub mod resource_manager;

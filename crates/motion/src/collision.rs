@@ -6,7 +6,8 @@
 //! contact is allowed; free motions are searched with the vector checks of `arm` and `space`.
 //!
 //! Moving shapes are grown by a padding. Between two postures no further apart than [`Checker::steps`] allows, no distance is smaller by more than
-//! the padding than in the nearer posture: if both are free, the motion between them is. Meshes are checked as they are. Pairs of links that
+//! the padding than in the nearer posture: if both are free, the motion between them is. Without padding a motion is checked in pieces, each by the
+//! distance in its middle (`free_in_pieces`). Meshes are checked as they are. Pairs of links that
 //! spheres cannot decide ([`Checks::by_shapes`](crate::pairs::Checks::by_shapes)) may be built to run closer to each other than the padding, so
 //! they have none: for these pairs the finished motion is checked, from posture to posture (`validate`).
 
@@ -43,8 +44,11 @@ pub const CONTACT_TOLERANCE_M: f64 = 0.012;
 /// Relative enlargement of the bounding sphere of a mesh, for rounding.
 const ROUNDED: f64 = 1e-5;
 
-/// Maximum distance that a point moves between two checked postures if there is no padding, in metres.
+/// Maximum distance that a point moves in one of the [`steps`](Checker::steps) of a motion if there is no padding, in metres.
 const UNPADDED_STEP_M: f64 = 0.005;
+
+/// Without padding, a contact less deep than this may be missed on a motion, in metres.
+pub(crate) const RESOLUTION_M: f64 = 5e-4;
 
 /// Checks postures against one scene.
 #[derive(Clone)]
@@ -251,6 +255,18 @@ impl<'a> Checker<'a> {
         self.centres.truncate(kept.len());
     }
 
+    /// The same checker for those pairs of links of which at least one is a finger or moves with one.
+    pub(crate) fn of_fingers(mut self) -> Checker<'a> {
+        let fingers = self.robot.finger_links();
+        let is_finger = |moving: &Moving| fingers.contains(&moving.frame);
+        self.moving.iter_mut().filter(|moving| !is_finger(moving)).for_each(|moving| moving.obstacles.clear());
+        let moving = &self.moving;
+        self.pairs.retain(|(i, j)| is_finger(&moving[*i]) || is_finger(&moving[*j]));
+        self.forget_idle(|_| false);
+        self.find_reach();
+        self
+    }
+
     /// The same checker with a point cloud in the frame of the base.
     pub fn beside(self, cloud: Option<Arc<Cloud>>) -> Checker<'a> {
         Checker { cloud, ..self }
@@ -276,7 +292,11 @@ impl<'a> Checker<'a> {
                 reach: [body.geometry.radius(), self.padding * 3_f64.sqrt()],
             });
             let meshes = link.meshes.iter().map(|meshed| {
-                let (solid, padded) = (Solid::mesh(&meshed.mesh, 0.0), Solid::mesh(&meshed.mesh, self.padding));
+                // How deep the gripper is decides what it may press.
+                let is_gripper = matches!(moving, Some((_, _, Role::Hand | Role::Finger)));
+                let solid =
+                    if is_gripper { Solid::pressing_mesh(&meshed.mesh, 0.0) } else { Solid::mesh(&meshed.mesh, 0.0) };
+                let padded = Solid::mesh(&meshed.mesh, self.padding);
                 let around = solid.shape.compute_local_bounding_sphere();
                 let reach = [f64::from(around.radius) * (1.0 + ROUNDED), self.padding];
                 Part { at: meshed.pose, solid, padded, middle: around.center, reach }
@@ -497,6 +517,9 @@ impl<'a> Checker<'a> {
         if !self.is_free(to, contact) {
             return false;
         }
+        if self.padding <= 0.0 {
+            return self.collision_between(from, to, contact).is_none();
+        }
         // Bisection: an edge is most likely in collision at its middle.
         let steps = self.steps(from, to);
         let mut stride = steps.next_power_of_two();
@@ -513,8 +536,53 @@ impl<'a> Checker<'a> {
 
     /// The first collision of the straight motion from one posture to another, both included.
     pub fn edge_collision(&mut self, from: &JointVector, to: &JointVector, contact: Contact) -> Option<Collision> {
+        if self.padding <= 0.0 {
+            let at_start = self.collision(from, contact).or_else(|| self.collision_between(from, to, contact));
+            return at_start.or_else(|| self.collision(to, contact));
+        }
         let steps = self.steps(from, to);
         (0..=steps).find_map(|i| self.collision(&between(from, to, i as f64 / steps as f64), contact))
+    }
+
+    /// The first collision between two postures, without padding; the postures themselves are not checked.
+    fn collision_between(&mut self, from: &JointVector, to: &JointVector, contact: Contact) -> Option<Collision> {
+        let mut piece = |[begin, end]: [f64; 2]| {
+            let strays = JointVector::from_fn(from.len(), |j| (to[j] - from[j]).abs() * (end - begin) / 2.0);
+            (between(from, to, (begin + end) / 2.0), strays)
+        };
+        let found = self.free_in_pieces([0.0, 1.0], contact, &mut piece, &mut || true);
+        found.err().map(|(_, collision)| collision)
+    }
+
+    /// Checks the middle of a piece of a motion. If the distance there is more than anything moves from there within the piece, the piece is free;
+    /// otherwise its halves are checked, in the order of the motion, until they are so short that nothing moves by more than [`RESOLUTION_M`].
+    /// `piece` returns the posture in the middle of a piece, and by how much each joint strays from it within the piece. `goes_on` is called
+    /// before each check; returns whether all of it was checked. For a checker without padding.
+    ///
+    /// # Errors
+    /// The first collision, and where it is.
+    pub(crate) fn free_in_pieces(
+        &mut self,
+        whole: [f64; 2],
+        contact: Contact,
+        piece: &mut dyn FnMut([f64; 2]) -> (JointVector, JointVector),
+        goes_on: &mut dyn FnMut() -> bool,
+    ) -> Result<bool, (f64, Collision)> {
+        let mut pieces = vec![whole];
+        while let Some([begin, end]) = pieces.pop() {
+            if !goes_on() {
+                return Ok(false);
+            }
+            let middle = (begin + end) / 2.0;
+            let (posture, strays) = piece([begin, end]);
+            let moves_m = self.moves_m(&strays);
+            let room = self.room(&posture, contact, moves_m).map_err(|collision| (middle, collision))?;
+            if room < moves_m && moves_m > RESOLUTION_M {
+                // The last piece is checked first.
+                pieces.extend([[middle, end], [begin, middle]]);
+            }
+        }
+        Ok(true)
     }
 
     /// Sets the posture of the arm.

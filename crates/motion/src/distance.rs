@@ -7,6 +7,7 @@
 //! exact. Of a mesh only the surface counts; the trees of parry3d find the triangles that matter, for two meshes both at once.
 
 use crate::frame::{cross, difference, norm, rotate};
+use crate::mesh::ConvexPiece;
 use parry3d::bounding_volume::Aabb;
 use parry3d::math::{Pose as Pose32, Vector};
 use parry3d::partitioning::BvhNode;
@@ -49,7 +50,7 @@ pub fn gap_within([a_at, b_at]: [&Pose32; 2], [a, b]: [&dyn Shape; 2], enough_m:
 }
 
 /// Penetration of two shapes that touch, in metres: the shortest translation that separates them. The result may be more than that; it is never
-/// less if neither is a mesh.
+/// less if neither is a mesh. Of a mesh it is the greatest penetration of one of its triangles.
 pub fn depth(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> f64 {
     let pose = a_at.inv_mul(b_at);
     let contact = DefaultQueryDispatcher.contact(&pose, a, b, ROUGH_M).ok().flatten();
@@ -64,6 +65,26 @@ pub fn depth(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> f64 
     }
     let found = contact.map(|contact| contact.normal1.to_array().map(f64::from));
     least_overlap(&first, &second, found).map_or(0.0, |(_, overlap)| overlap.max(0.0))
+}
+
+/// Penetration of a convex piece of a mesh in a primitive, in metres: the overlap along the direction, of those across faces of either and away from
+/// the axes of the primitive, along which it is least. It may be more than the shortest translation that separates them. 0 or less if they are
+/// apart, `None` if the other shape is no primitive.
+pub(crate) fn depth_of_piece(a_at: &Pose32, piece: &ConvexPiece, b_at: &Pose32, b: &dyn Shape) -> Option<f64> {
+    let second = Turned::new(Round::of(b)?, &a_at.inv_mul(b_at));
+    let extent = |way: Point| piece.corners.iter().map(|corner| dot(*corner, way)).fold(f64::NEG_INFINITY, f64::max);
+    let middle =
+        piece.corners.iter().fold([0.0; 3], |at, corner| sum(at, *corner)).map(|c| c / piece.corners.len() as f64);
+    let faces = second.round.core.axes().into_iter().map(|axis| second.rotate(axis));
+    let away =
+        second.round.core.lines().into_iter().map(|line| aside(difference(second.at, middle), second.rotate(line)));
+    let ways = faces.chain(away).chain([difference(second.at, middle)]).flat_map(|way| [way, way.map(|c| -c)]);
+    let overlap = |way: Point| {
+        let length = norm(way);
+        let way = way.map(|c| c / length);
+        (length > SAME_M).then(|| extent(way) + second.along(way.map(|c| -c)))
+    };
+    ways.chain(piece.normals.iter().copied()).filter_map(overlap).min_by(f64::total_cmp)
 }
 
 /// Direction of the shortest known translation that moves the first of two touching shapes out of the other, a unit vector in the world frame.
@@ -91,11 +112,7 @@ fn least_overlap(first: &Round, second: &Turned, found: Option<Point>) -> Option
     // upper bound of the penetration.
     let faces = [first.core.axes(), turned(second.round.core.axes())].concat();
     let across = lines.iter().flat_map(|line| its.iter().map(|other| cross(*line, *other)));
-    let aside = |line: &Point| {
-        let along = dot(second.at, *line) / dot(*line, *line).max(f64::MIN_POSITIVE);
-        difference(second.at, line.map(|c| c * along))
-    };
-    let away = lines.iter().chain(&its).map(aside);
+    let away = lines.iter().chain(&its).map(|line| aside(second.at, *line));
     let ways = faces.into_iter().chain(across).chain(away).chain([second.at, [1.0, 0.0, 0.0]]).chain(found);
     let ways = ways.flat_map(|way| [way, way.map(|c| -c)]);
     let overlap = |way: Point| {
@@ -104,6 +121,12 @@ fn least_overlap(first: &Round, second: &Turned, found: Option<Point>) -> Option
         (length > SAME_M).then(|| (way, first.along(way) + second.along(way.map(|c| -c))))
     };
     ways.filter_map(overlap).min_by(|(_, a), (_, b)| a.total_cmp(b))
+}
+
+/// The part of a vector that is perpendicular to a line.
+fn aside(vector: Point, line: Point) -> Point {
+    let along = dot(vector, line) / dot(line, line).max(f64::MIN_POSITIVE);
+    difference(vector, line.map(|c| c * along))
 }
 
 /// As [`gap`], with the pose of the second shape in the frame of the first.

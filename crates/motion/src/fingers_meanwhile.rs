@@ -4,11 +4,10 @@
 //! A stretch of the arm's way is checked together with a stretch of the fingers' way. Both are free if, at the middle of both, the distance to
 //! everything is more than anything moves from there within them. Otherwise the stretch that causes the larger motion is halved, until nothing
 //! moves by more than half a millimetre. That is the check of a trajectory (`validate`) with the fingers as one more joint, so nothing is too thin
-//! to be found.
+//! to be found. Only pairs with a finger are compared: those of the arm's other links are part of the check of its trajectory.
 
-use crate::collision::{Checker, Collision, Contact, between};
+use crate::collision::{Checker, Collision, Contact, RESOLUTION_M, between};
 use crate::joint_vector::JointVector;
-use crate::validate::RESOLUTION_M;
 
 /// The maximum number of checks was not enough.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,6 +34,7 @@ pub fn met_on_the_way(
     most: usize,
 ) -> Result<Option<Collision>, TooLong> {
     let Some(last) = postures.len().checked_sub(1) else { return Ok(None) };
+    checker = checker.of_fingers();
     checker.set_finger(fingers[0]);
     while let Some(met) = checker.collision(&postures[0], Contact::None) {
         checker = checker.but_for(&met);

@@ -8,7 +8,7 @@
 //! The gripper moves straight, and the penetration of two convex shapes has no valley along a straight line: checking postures close to each other
 //! is enough.
 
-use crate::collision::{Checker, Collision, Contact, Touch, between};
+use crate::collision::{Checker, Collision, Contact, RESOLUTION_M, Touch, between};
 use crate::joint_vector::JointVector;
 
 /// Tolerance for the growth of a penetration, in metres: rounding, and what nobody would call a contact.
@@ -65,7 +65,8 @@ impl Leaving {
         from: &JointVector,
         to: &JointVector,
     ) -> Result<(), Collision> {
-        let steps = checker.steps(from, to);
+        let turns = JointVector::from_fn(from.len(), |j| to[j] - from[j]);
+        let steps = ((checker.moves_m(&turns) / RESOLUTION_M).ceil() as usize).max(1);
         (1..=steps).try_for_each(|i| self.comes_to(checker, &between(from, to, i as f64 / steps as f64)))
     }
 

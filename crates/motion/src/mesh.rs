@@ -3,7 +3,7 @@
 
 use crate::inside::Inside;
 use crate::mesh_pieces;
-pub use crate::mesh_pieces::MeshPieces;
+pub use crate::mesh_pieces::{ConvexPiece, MeshPieces};
 use crate::spheres::Sphere;
 use crate::{collada, mesh_cover, obj, stl};
 use parry3d::math::Vector;

@@ -29,6 +29,9 @@ const DIRECTIONS: usize = 400;
 const LOOK_M: f64 = 0.01;
 const MOST_ALONG: usize = 8;
 
+/// Faces whose normals, of length 1, differ by less than this count as parts of one face.
+const SAME_NORMAL: f64 = 1e-3;
+
 /// Thickness given to a flat piece, in metres.
 const THICK_M: f64 = 1e-4;
 
@@ -38,10 +41,21 @@ type Polygon = Vec<Corner>;
 /// Convex pieces that hold a mesh.
 #[derive(Debug, Clone)]
 pub struct MeshPieces {
-    /// The corners of each piece.
-    pub hulls: Vec<Vec<Corner>>,
+    /// The pieces.
+    pub hulls: Vec<ConvexPiece>,
     /// How far a piece stands out of the mesh at most, at the points that were compared, in metres.
     pub stands_out_m: f64,
+}
+
+/// One of them.
+#[derive(Debug, Clone)]
+pub struct ConvexPiece {
+    /// Its corners.
+    pub corners: Vec<Corner>,
+    /// Outward normals of its faces, those with the same normal once. A flat piece has none.
+    pub(crate) normals: Vec<Corner>,
+    /// How far it stands out of the mesh, at the points that were compared, in metres.
+    pub(crate) stands_out_m: f64,
 }
 
 /// A part of the surface, and its hull.
@@ -76,7 +90,11 @@ pub(crate) fn pieces(triangles: &[[Corner; 3]], shape: &SharedShape, inside: &In
         pieces.extend(halves.map(|surface| whole.piece(surface)));
     }
     let stands_out_m = pieces.iter().map(|piece| piece.out_m).fold(0.0, f64::max);
-    MeshPieces { hulls: pieces.into_iter().map(|piece| piece.hull.corners).collect(), stands_out_m }
+    let convex = |Piece { hull, out_m, .. }: Piece| {
+        let normals = hull.normals();
+        ConvexPiece { corners: hull.corners, normals, stands_out_m: out_m }
+    };
+    MeshPieces { hulls: pieces.into_iter().map(convex).collect(), stands_out_m }
 }
 
 impl Whole<'_> {
@@ -142,6 +160,19 @@ impl Hull {
             // A flat piece, or a line.
             _ => Hull { corners: thickened(&corners), faces: Vec::new() },
         }
+    }
+
+    fn normals(&self) -> Vec<Corner> {
+        let mut normals: Vec<Corner> = Vec::new();
+        for [a, b, c] in &self.faces {
+            let across = cross(difference(*b, *a), difference(*c, *a));
+            let length = norm(across);
+            let normal = across.map(|c| c / length);
+            if length > 0.0 && normals.iter().all(|known| norm(difference(*known, normal)) > SAME_NORMAL) {
+                normals.push(normal);
+            }
+        }
+        normals
     }
 
     fn volume(&self) -> f64 {
@@ -260,7 +291,8 @@ mod tests {
     fn what_is_convex_is_one_piece_and_a_u_is_few_that_leave_it_open() {
         let cube = prism(&[[0.0, 0.0], [0.1, 0.0], [0.1, 0.1], [0.0, 0.1]], &[[0, 1, 2], [0, 2, 3]], 0.1);
         let one = cube.pieces();
-        assert_eq!((one.hulls.len(), one.hulls[0].len()), (1, 8));
+        let [cube] = &one.hulls[..] else { panic!("{one:?}") };
+        assert_eq!((cube.corners.len(), cube.normals.len()), (8, 6));
         // Its hull stands out of it by 3 cm.
         let few = u().pieces().clone();
         assert!(few.hulls.len() < 8 && few.stands_out_m <= CLOSE_M, "{few:?}");
@@ -290,7 +322,7 @@ mod tests {
             .iter()
             .map(|hull| {
                 let points: Vec<Vector> =
-                    hull.iter().map(|[x, y, z]| Vector::new(*x as f32, *y as f32, *z as f32)).collect();
+                    hull.corners.iter().map(|[x, y, z]| Vector::new(*x as f32, *y as f32, *z as f32)).collect();
                 SharedShape::convex_hull(&points).unwrap()
             })
             .collect();

@@ -117,7 +117,11 @@ fn plan_with_ends(
         let first_length_rad = before_rad + f64::from(path_length(&first.path)) + candidate.length_rad;
         let (goal, before) = (candidate.goal(), Before { depart: &depart, length_rad: before_rad, first_length_rad });
         match Improvement::new(&mut arm, &mut candidates, before).run(first, &mut pace) {
-            Err(PlanError::Unseen { .. }) if arm.doubt_between(&start, &goal) => {}
+            Err(PlanError::Unseen { reason }) => {
+                if !arm.doubt_between(&start, &goal, &mut pace)? {
+                    return Err(PlanError::Unseen { reason });
+                }
+            }
             planned => return planned,
         }
     }
@@ -135,7 +139,7 @@ fn first_way(
     let budget = Budget { iterations: MAX_SEARCH_ITERATIONS, seed: arm.request().seed };
     pace.iteration()?;
     let mut route = arm.connect(door, &doors, budget, pace);
-    if matches!(route, Err(ConnectError::Exhausted { .. })) && arm.doubt_between(start, &arm.joints(&doors[0])) {
+    if matches!(route, Err(ConnectError::Exhausted { .. })) && arm.doubt_between(start, &arm.joints(&doors[0]), pace)? {
         route = arm.connect(door, &doors, budget, pace);
     }
     match route {

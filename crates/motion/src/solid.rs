@@ -3,7 +3,7 @@
 use crate::distance;
 use crate::geometry::Body;
 use crate::inside::Inside;
-use crate::mesh::Mesh;
+use crate::mesh::{ConvexPiece, Mesh};
 use parry3d::math::{Pose as Pose32, Vector};
 use parry3d::shape::SharedShape;
 use std::sync::Arc;
@@ -16,6 +16,8 @@ pub(crate) struct Solid {
     pub(crate) skin_m: f64,
     /// The inside of a mesh; other shapes are solid by themselves.
     pub(crate) inside: Option<Arc<Inside>>,
+    /// The mesh, if its penetration counts as that of its convex pieces, too.
+    deep: Option<Arc<Mesh>>,
 }
 
 /// A shape with its pose.
@@ -28,13 +30,19 @@ pub(crate) struct Placed<'s> {
 impl Solid {
     /// A primitive, padded on every side.
     pub(crate) fn primitive(body: &Body, padding_m: f64) -> Solid {
-        Solid { shape: body.geometry.shape(padding_m), skin_m: 0.0, inside: None }
+        Solid { shape: body.geometry.shape(padding_m), skin_m: 0.0, inside: None, deep: None }
     }
 
     /// A mesh, padded on every side.
     pub(crate) fn mesh(mesh: &Mesh, padding_m: f64) -> Solid {
         let (shape, inside) = mesh.solid();
-        Solid { shape, skin_m: padding_m, inside: Some(inside) }
+        Solid { shape, skin_m: padding_m, inside: Some(inside), deep: None }
+    }
+
+    /// As [`Solid::mesh`], and as deep in a primitive as the mesh is in all, not only as its deepest triangle. The convex pieces of the mesh are
+    /// computed when they are first needed, which takes long for a large mesh.
+    pub(crate) fn pressing_mesh(mesh: &Arc<Mesh>, padding_m: f64) -> Solid {
+        Solid { deep: Some(Arc::clone(mesh)), ..Solid::mesh(mesh, padding_m) }
     }
 }
 
@@ -60,7 +68,19 @@ impl Placed<'_> {
                 None => gap,
             };
         }
-        -distance::depth(&self.pose, &*self.solid.shape, &other.pose, &*other.solid.shape) - skin_m
+        let surface_m = distance::depth(&self.pose, &*self.solid.shape, &other.pose, &*other.solid.shape);
+        -surface_m.max(self.pieces_deep_m(other)).max(other.pieces_deep_m(self)) - skin_m
+    }
+
+    /// Penetration of the convex pieces of this mesh in a primitive, in metres: that of the deepest piece, minus by how much the piece stands out of
+    /// the mesh. 0 if the mesh does not count by its pieces, or the other shape is no primitive.
+    fn pieces_deep_m(&self, other: &Placed<'_>) -> f64 {
+        let pieces = self.solid.deep.iter().flat_map(|mesh| &mesh.pieces().hulls);
+        let deep_m = |piece: &ConvexPiece| {
+            let deep_m = distance::depth_of_piece(&self.pose, piece, &other.pose, &*other.solid.shape)?;
+            Some(deep_m - piece.stands_out_m)
+        };
+        pieces.filter_map(deep_m).fold(0.0, f64::max)
     }
 
     /// Distance between the outer surfaces of the skins.
@@ -102,7 +122,7 @@ mod tests {
 
     #[test]
     fn a_pair_that_cannot_be_decided_touches() {
-        let solid = |shape: SharedShape| Solid { shape, skin_m: 0.0, inside: None };
+        let solid = |shape: SharedShape| Solid { shape, skin_m: 0.0, inside: None, deep: None };
         let floor = solid(SharedShape::new(HalfSpace::new(Vector::new(0.0, 0.0, 1.0))));
         let ball = solid(SharedShape::ball(0.1));
         let at = |solid, z: f32| Placed { pose: Pose32::from_translation(Vector::new(0.0, 0.0, z)), solid };

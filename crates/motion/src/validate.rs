@@ -1,6 +1,6 @@
 //! Validates a trajectory of the arm: what a controller checks before it moves, with what it knows itself.
 
-use crate::collision::{Checker, Collision, Contact};
+use crate::collision::{Checker, Collision, Contact, RESOLUTION_M};
 use crate::cubic::Cubic;
 use crate::joint_vector::{JointVector, PerJoint};
 use crate::leaving::Leaving;
@@ -18,9 +18,6 @@ const LIMIT_TOLERANCE: f64 = 0.01;
 
 /// By how much a position may exceed its limit, in radians or metres.
 const POSITION_TOLERANCE: f64 = 1e-3;
-
-/// A contact less deep than this may be missed, in metres.
-pub(crate) const RESOLUTION_M: f64 = 5e-4;
 
 /// Why a trajectory may not be followed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -224,8 +221,7 @@ fn left_after_s(mut leaving: Leaving, checker: &mut Checker<'_>, trajectory: &Cu
     Err(Violation::Collision { time_s: trajectory.duration_s(), collision: leaving.told() })
 }
 
-/// Checks the middle of a piece of the curve. If the distance there is more than anything moves from there within the piece, the piece is free;
-/// otherwise its halves are checked, until they are so short that nothing moves by more than [`RESOLUTION_M`].
+/// Checks a part of the curve, in pieces that are halved where there is little room.
 fn check_part(
     checker: &mut Checker<'_>,
     trajectory: &Curve,
@@ -239,22 +235,18 @@ fn check_part(
     for (i, pair) in knots.windows(2).enumerate() {
         let cubics = trajectory.cubics(i);
         let within = [begins_s.max(pair[0].time_s), ends_s.min(pair[1].time_s)].map(|time_s| time_s - pair[0].time_s);
-        // In the order of time: the last piece is checked first.
-        let mut pieces = if within[0] < within[1] { vec![within] } else { Vec::new() };
-        while let Some([from, to]) = pieces.pop() {
-            if !goes_on() {
-                return Ok(false);
-            }
-            let middle = (from + to) / 2.0;
-            let posture = cubics.map(|cubic| cubic.position_at(middle));
+        let mut piece = |[from, to]: [f64; 2]| {
+            let posture = cubics.map(|cubic| cubic.position_at((from + to) / 2.0));
             let strays = JointVector::from_fn(posture.len(), |j| {
                 let [least, greatest] = cubics[j].range(from, to);
                 (posture[j] - least).max(greatest - posture[j])
             });
-            let moves_m = checker.moves_m(&strays);
-            let room = checker.room(&posture, contact, moves_m).map_err(collides(pair[0].time_s + middle))?;
-            if room < moves_m && moves_m > RESOLUTION_M {
-                pieces.extend([[middle, to], [from, middle]]);
+            (posture, strays)
+        };
+        if within[0] < within[1] {
+            let free = checker.free_in_pieces(within, contact, &mut piece, goes_on);
+            if !free.map_err(|(at, collision)| collides(pair[0].time_s + at)(collision))? {
+                return Ok(false);
             }
         }
     }

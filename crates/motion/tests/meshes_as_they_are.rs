@@ -193,3 +193,78 @@ fn a_search_that_spheres_leave_no_way_for_is_made_again_with_the_meshes() {
     let found = planned(&robot, &objects, &request(&robot, [0.0, 0.1], [1.2, 0.1])).unwrap();
     assert!(lifted_m(&robot, &found) < 0.2, "{found:?}");
 }
+
+/// An STL of the same cuboid whose faces are cut into triangles with edges of at most 2 mm.
+fn finely_cut(half: [f64; 3]) -> Vec<u8> {
+    let facets = (0..3).flat_map(|axis| {
+        let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
+        let cells = [u, v].map(|along: usize| (half[along] / 0.001).ceil() as usize);
+        let at = move |side: f64, [i, j]: [usize; 2]| {
+            let mut corner = [0.0; 3];
+            corner[axis] = side * half[axis];
+            corner[u] = half[u] * (2.0 * i as f64 / cells[0] as f64 - 1.0);
+            corner[v] = half[v] * (2.0 * j as f64 / cells[1] as f64 - 1.0);
+            corner
+        };
+        let places = (0..cells[0]).flat_map(move |i| (0..cells[1]).map(move |j| [i, j]));
+        places.flat_map(move |[i, j]| {
+            [-1.0, 1.0].into_iter().flat_map(move |side| {
+                let [a, b, c, d] = [[i, j], [i + 1, j], [i + 1, j + 1], [i, j + 1]].map(|place| at(side, place));
+                if side > 0.0 { [[a, b, c], [a, c, d]] } else { [[a, c, b], [a, d, c]] }
+            })
+        })
+    });
+    let facet = |triangle: [[f64; 3]; 3]| {
+        let corners: String = triangle.iter().map(|[x, y, z]| format!("vertex {x} {y} {z}\n")).collect();
+        format!("facet normal 0 0 0\nouter loop\n{corners}endloop\nendfacet\n")
+    };
+    format!("solid finger\n{}endsolid finger\n", facets.map(facet).collect::<String>()).into_bytes()
+}
+
+/// A hand that is lifted, with two fingers below it, of which the tips are 4 cm below the hand's middle.
+fn gripper(finger: &[u8]) -> Robot {
+    let slide = |name: &str, parent: &str, child: &str, axis: &str, upper: f64, mimic: &str| {
+        format!(
+            "<joint name='{name}' type='prismatic'><parent link='{parent}'/><child link='{child}'/><axis xyz='{axis}'/>\
+             <limit lower='0' upper='{upper}' velocity='1' effort='1'/>{mimic}</joint>"
+        )
+    };
+    let finger_link = |name: &str| {
+        format!("<link name='{name}'><collision><geometry><mesh filename='finger.stl'/></geometry></collision></link>")
+    };
+    let urdf = format!(
+        "<robot name='r'><link name='foot'/><link name='hand'/>{}{}{}{}{}</robot>",
+        finger_link("left"),
+        finger_link("right"),
+        slide("up", "foot", "hand", "0 0 1", 0.6, ""),
+        slide("opens", "hand", "left", "0 1 0", 0.04, ""),
+        slide("too", "hand", "right", "0 -1 0", 0.04, "<mimic joint='opens'/>"),
+    );
+    let toml = "name = 'r'\nurdf = 'r.urdf'\n[arm]\njoints = ['up']\ntool = 'hand'\n\
+                [gripper]\njoint = 'opens'\nhand = 'hand'\nfinger = 'left'\n";
+    Robot::of(RobotDescription::read(toml).unwrap(), &urdf, None, &mut |_| Ok(finger.to_vec())).unwrap()
+}
+
+#[test]
+fn a_finger_is_as_deep_in_something_as_it_is_however_finely_its_mesh_is_cut() {
+    let half = [0.01, 0.007, 0.04];
+    for (stl, cut) in [(cuboid(half), "coarsely"), (finely_cut(half), "finely")] {
+        let robot = gripper(&stl);
+        let open = Configuration { finger: 0.03, ..robot.at_zero() };
+        let tray = |top: f64| scene(vec![object("tray", [0.0, 0.0, top - 0.005], [0.3, 0.3, 0.01])]);
+        let depth_m = |top: f64| {
+            let mut checker = Checker::new(&robot, &tray(top), &open, 0.0);
+            let collision = checker.collision(&JointVector::of([0.0]), Contact::None);
+            let may_press = checker.is_free(&JointVector::of([0.0]), Contact::Gripper(0.007));
+            (collision.map_or(0.0, |collision| collision.depth_m), may_press)
+        };
+        // Right through a tray of 10 mm: only the way up, or down, leads out.
+        let (through, may) = depth_m(0.005);
+        assert!((through - 0.045).abs() < 0.0025 && !may, "{cut}: {through}");
+        // On the tray, and in it by as much as fingers may press.
+        let (pressed, may) = depth_m(-0.035);
+        assert!((pressed - 0.005).abs() < 1e-4 && may, "{cut}: {pressed}");
+        let (pressed, may) = depth_m(-0.031);
+        assert!(pressed > 0.008 && !may, "{cut}: {pressed}");
+    }
+}

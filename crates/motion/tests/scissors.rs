@@ -5,10 +5,11 @@ use ratn_model::pose::Pose;
 use ratn_model::value::{Trajectory, TrajectoryPoint};
 use ratn_motion::collision::{Checker, Contact};
 use ratn_motion::description::RobotDescription;
+use ratn_motion::fingers_meanwhile::met_on_the_way;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{Configuration, Robot};
 use ratn_motion::validate::validate_trajectory;
-use ratn_world::scene::Scene;
+use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 
 /// Two levers of 0.5 m, whose tips are boxes of `edge` metres; one joint turns the tips past each other, as the second lever mimics the first.
 fn scissors(edge: f64) -> Robot {
@@ -78,4 +79,74 @@ fn no_two_links_come_nearer_to_each_other_in_one_step_than_twice_the_padding() {
             assert!(checker.edge_collision(&from, &to, Contact::None).is_some(), "{edge}, {padding}");
         }
     }
+}
+
+/// An arm that slides along a rail, 1 mm above it, with a hand beyond the rail's end, whose fingers open.
+fn on_a_rail() -> Robot {
+    let slide = |name: &str, parent: &str, child: &str, axis: &str, upper: f64, mimic: &str| {
+        format!(
+            "<joint name='{name}' type='prismatic'><parent link='{parent}'/><child link='{child}'/><axis xyz='{axis}'/>\
+             <limit lower='0' upper='{upper}' velocity='1' effort='1'/>{mimic}</joint>"
+        )
+    };
+    let boxed = |name: &str, at: &str, size: &str| {
+        format!(
+            "<link name='{name}'><collision><origin xyz='{at}'/><geometry><box size='{size}'/></geometry></collision></link>"
+        )
+    };
+    let urdf = format!(
+        "<robot name='r'>{}<link name='stand'/>{}<link name='hand'/>{}{}{}{}{}{}{}</robot>",
+        boxed("rail", "0 0 -0.026", "3 0.1 0.05"),
+        boxed("sled", "0 0 0.02", "0.1 0.1 0.04"),
+        boxed("left", "0 0.01 0", "0.02 0.02 0.02"),
+        boxed("right", "0 -0.01 0", "0.02 0.02 0.02"),
+        slide("up", "rail", "stand", "0 0 1", 0.001, ""),
+        slide("along", "stand", "sled", "1 0 0", 1.0, ""),
+        "<joint name='arm' type='fixed'><parent link='sled'/><child link='hand'/><origin xyz='0 0 0.5'/></joint>",
+        slide("opens", "hand", "left", "0 1 0", 0.04, ""),
+        slide("too", "hand", "right", "0 -1 0", 0.04, "<mimic joint='opens'/>"),
+    );
+    let toml = "name = 'r'\nurdf = 'r.urdf'\n[arm]\njoints = ['up', 'along']\ntool = 'hand'\n\
+                [gripper]\njoint = 'opens'\nhand = 'hand'\nfinger = 'left'\n";
+    let srdf = "<robot name='r'><disable_collisions link1='left' link2='right'/></robot>";
+    let description = RobotDescription::read(toml).unwrap();
+    Robot::of(description, &urdf, Some(srdf), &mut |_| unreachable!("it has no meshes")).unwrap()
+}
+
+#[test]
+fn fingers_that_open_on_the_way_are_compared_and_links_that_run_close_to_each_other_are_not() {
+    let robot = on_a_rail();
+    let nothing = Scene { base: Pose::IDENTITY, objects: Vec::new() };
+    let way: Vec<JointVector> = (0..=100).map(|i| JointVector::of([0.0, 0.01 * f64::from(i)])).collect();
+    let met =
+        |most: usize| met_on_the_way(Checker::new(&robot, &nothing, &robot.at_zero(), 0.0), &way, [0.0, 0.04], most);
+    assert_eq!(met(200), Ok(None));
+}
+
+#[test]
+fn a_link_without_padding_does_not_pass_through_something_thinner_than_its_steps() {
+    let urdf = "<robot name='r'><link name='foot'/><link name='plate'><collision><geometry><box size='0.001 0.2 0.2'/></geometry></collision></link>\
+                <joint name='slides' type='prismatic'><parent link='foot'/><child link='plate'/><axis xyz='1 0 0'/>\
+                <limit lower='0' upper='1' velocity='1' effort='1'/></joint></robot>";
+    let toml = "name = 'r'\nurdf = 'r.urdf'\n[arm]\njoints = ['slides']\ntool = 'plate'\n";
+    let description = RobotDescription::read(toml).unwrap();
+    let robot = Robot::of(description, urdf, None, &mut |_| unreachable!("it has no meshes")).unwrap();
+    let beside = |x: f64| {
+        let film = SceneObject {
+            name: "film".into(),
+            shape: Shape::Box { size: [0.0005, 0.2, 0.2] },
+            placement: Placement::World(Pose::at(x, 0.0, 0.0)),
+        };
+        Checker::new(&robot, &Scene { base: Pose::IDENTITY, objects: vec![film] }, &robot.at_zero(), 0.0)
+    };
+    let [from, to] = [[0.0], [0.31]].map(JointVector::of);
+    for x in (0..20).map(|i| 0.2 + 0.0007 * f64::from(i)) {
+        let mut checker = beside(x);
+        assert!(!checker.edge_is_free(&from, &to, Contact::None), "{x}");
+        assert_eq!(checker.edge_collision(&from, &to, Contact::None).unwrap().other, "film", "{x}");
+    }
+    // Away from it there is room.
+    let (from, mut checker) = (JointVector::of([0.2012]), beside(0.2));
+    assert!(checker.edge_is_free(&from, &to, Contact::None));
+    assert_eq!(checker.edge_collision(&from, &to, Contact::None), None);
 }

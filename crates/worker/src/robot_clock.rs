@@ -1,13 +1,15 @@
 //! Robot time: wall time since a start, multiplied by the speed at which the cell runs. Durations in goals, trajectories and event logs are
-//! robot time.
+//! robot time. It goes on while the machine is suspended, as it does while a process is ([`BootClock`]).
 
+use crate::boot_clock::{BootClock, BootInstant};
 use ratn_model::time::Timestamp;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// A clock of robot time.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct RobotClock {
-    start: Instant,
+    wall: BootClock,
+    start: BootInstant,
     /// Robot time at the start.
     at: Timestamp,
     speed: f64,
@@ -21,12 +23,22 @@ impl RobotClock {
 
     /// A clock that is at `at` now.
     pub fn going_on(at: Timestamp, speed: f64) -> RobotClock {
-        RobotClock { start: Instant::now(), at, speed }
+        RobotClock::by(BootClock::default(), at, speed)
+    }
+
+    /// As [`RobotClock::going_on`], with this clock of wall time.
+    pub fn by(wall: BootClock, at: Timestamp, speed: f64) -> RobotClock {
+        RobotClock { start: wall.now(), wall, at, speed }
+    }
+
+    /// The present wall time.
+    pub fn wall(&self) -> BootInstant {
+        self.wall.now()
     }
 
     /// The present robot time.
     pub fn now(&self) -> Timestamp {
-        self.at + self.start.elapsed().mul_f64(self.speed)
+        self.at + self.wall().saturating_duration_since(self.start).mul_f64(self.speed)
     }
 
     /// Wall time until a moment of robot time; zero if it is past.
@@ -45,6 +57,14 @@ mod tests {
         let wait = clock.until(Timestamp::from_seconds(100.0));
         assert!(wait <= Duration::from_secs(10) && wait > Duration::from_secs(9), "{wait:?}");
         assert_eq!(clock.until(Timestamp(0)), Duration::ZERO);
+    }
+
+    #[test]
+    fn robot_time_goes_on_while_the_machine_is_suspended() {
+        let wall = BootClock::suspendable();
+        let clock = RobotClock::by(wall.clone(), Timestamp(0), 10.0);
+        wall.suspend(Duration::from_secs(60));
+        assert!(clock.now() >= Timestamp::from_seconds(600.0));
     }
 
     #[test]

@@ -90,7 +90,8 @@ pub struct SessionState {
     pub generation: u64,
     /// When this client found the session to have expired; `None` while the session is alive, or was never alive.
     pub unheard_since: Option<Instant>,
-    /// The manager already knew the session at the first ping: the session goes on with what it has there.
+    /// The manager already knew the session at the first ping that was answered: the session goes on with what it has there. Never so for a session
+    /// whose id is new ([`Session::open`]), because no process before this one had it.
     pub found: bool,
     /// The session's number at the manager: a session that is made again under the same id has another one. 0 before the session was alive,
     /// and if the manager does not number its sessions.
@@ -98,6 +99,15 @@ pub struct SessionState {
     /// The manager's last answer was that the id belongs to another caller, who has a session of that id or had the last one
     /// ([`Session::taken`]).
     pub taken: bool,
+}
+
+/// Whether a process before this one may have had the session.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Predecessor {
+    /// None: the id is new.
+    None,
+    /// It may: the id was given.
+    Unknown,
 }
 
 /// Until when a client believes that its session lives: the time to live counted from the last answered ping, including time in which the
@@ -135,7 +145,8 @@ impl Session {
     /// Opens a session with the resource manager at `endpoint` and keeps it alive. `client` is a name for people, `ttl` the time to live:
     /// without a ping for so long, the manager ends the session. Returns at once; [`Session::alive`] waits.
     pub fn open(channels: &Channels, endpoint: &Endpoint, client: &str, ttl: Duration) -> Session {
-        Session::open_as(channels, endpoint, fresh_id(client), client, ttl)
+        let id = (fresh_id(client), Standing::default());
+        Session::keep(BootClock::default(), channels, endpoint, id, client, ttl, Predecessor::None)
     }
 
     /// As [`Session::open`], with an id of the caller's choice. If the client of a session with this id is gone and the session still
@@ -153,7 +164,7 @@ impl Session {
         ttl: Duration,
         standing: Standing,
     ) -> Session {
-        Session::keep(BootClock::default(), channels, endpoint, (id, standing), client, ttl)
+        Session::keep(BootClock::default(), channels, endpoint, (id, standing), client, ttl, Predecessor::Unknown)
     }
 
     /// As [`Session::open_as`], with this clock.
@@ -165,7 +176,7 @@ impl Session {
         client: &str,
         ttl: Duration,
     ) -> Session {
-        Session::keep(clock, channels, endpoint, (id, Standing::default()), client, ttl)
+        Session::keep(clock, channels, endpoint, (id, Standing::default()), client, ttl, Predecessor::Unknown)
     }
 
     fn keep(
@@ -175,6 +186,7 @@ impl Session {
         (id, standing): (String, Standing),
         client: &str,
         ttl: Duration,
+        predecessor: Predecessor,
     ) -> Session {
         let end = CancellationToken::new();
         let (tell, state) = watch::channel(SessionState::default());
@@ -188,6 +200,7 @@ impl Session {
             id: id.clone(),
             client: client.to_owned(),
             standing,
+            predecessor,
             ttl,
             expires,
             tell,
@@ -379,6 +392,7 @@ struct SessionTask {
     id: String,
     client: String,
     standing: Standing,
+    predecessor: Predecessor,
     ttl: Duration,
     clock: BootClock,
     expires: watch::Sender<BootInstant>,
@@ -460,8 +474,9 @@ impl SessionTask {
             let is_another = self.number.replace(answer.number).is_some_and(|before| before != answer.number);
             self.tell.send_if_modified(|state| {
                 let before = *state;
-                // A session that was not alive here did not exist before: the answer that said so may have been lost with its stream.
-                state.found |= before.generation == 0 && !answer.created;
+                // The answer that said `created` may have been lost with its stream.
+                let is_first = before.generation == 0 && !answer.created;
+                state.found |= is_first && self.predecessor == Predecessor::Unknown;
                 state.number = answer.number;
                 state.generation += u64::from(answer.created || is_another || before.generation == 0);
                 state.alive |= holds;

@@ -1,6 +1,7 @@
 //! Minimum distances between the parts of a robot. When an arm starts a motion, fingers begin to close or open, or the head begins to turn, the part
-//! is compared with every other arm, at its current posture and along the rest of its motion, and with a turning head (`clearance`). Fingers are
-//! also compared with their own robot and with a standing head; for an arm that starts a motion, the check of its trajectory covers those.
+//! is compared with every other arm, at its current posture and along the rest of its motion, and with a turning head (`clearance`). A head is also
+//! compared with the links of the robot that neither it nor an arm moves. Fingers are also compared with their own robot and with a standing head;
+//! for an arm that starts a motion, the check of its trajectory covers those.
 //!
 //! For the fingers of an arm, three positions count: the current one, the one that they move to, and open, because the holder of the arm's lease
 //! may open them. This holds for both of two moving arms, and moving fingers keep the same distance from another moving part as arms do. So the result does
@@ -17,6 +18,7 @@ use ratn_motion::fingers_meanwhile::{TooLong, met_on_the_way};
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{ArmPosition, Configuration};
 use ratn_world::scene::Scene;
+use std::collections::BTreeSet;
 
 /// Maximum distance between two finger positions that are compared, in metres.
 const FINGER_STEP_M: f64 = 0.002;
@@ -178,11 +180,12 @@ impl Cell {
         self.keeps_apart(&Ours::alike(ours), ["the head stays where it is: ", "the head stays where it is: its way"])
     }
 
-    /// The other parts that a part is compared with: the arms, and the head while it turns.
+    /// The other parts that a part is compared with: the arms, the head while it turns, and for the head the rest of the robot.
     fn beside(&self, part: Part) -> impl Iterator<Item = Part> {
         let turns = matches!(self.activities.get(&Module::PanTilt).map(|head| &head.kind), Some(Kind::Look { .. }));
         let others = self.arms.numbers().map(Part::Arm).chain(turns.then_some(Part::Head));
-        others.filter(move |other| *other != part)
+        let rest = (part == Part::Head).then_some(Part::Rest);
+        others.filter(move |other| *other != part).chain(rest)
     }
 
     /// `near` begins the message that parts come too close, `long` the message that the motion is too long to check.
@@ -210,6 +213,11 @@ impl Cell {
                      anywhere, so the ways of two that move at once must not cross: move one after the other, or plan another way",
                     does.apart_m() * 1e3
                 ),
+                (Crossing::TooClose { link, other: near_link }, Other::Stands) if other == Part::Rest => format!(
+                    "{near}{link} of {our_name} comes nearer than {:.0} mm to {near_link}, which no arm moves: look elsewhere, or except the \
+                     pair in the SRDF where the two are made to be as near as that",
+                    does.apart_m() * 1e3
+                ),
                 (Crossing::TooClose { link, other }, Other::Stands) => format!(
                     "{near}{link} of {our_name} comes nearer than {:.0} mm to {other} of {name}, which stands there with its fingers as they \
                      are or may open: move that arm away first, or plan another way",
@@ -230,6 +238,7 @@ impl Cell {
         match part {
             Part::Arm(arm) => format!("the arm `{}`", self.arms.name(arm)),
             Part::Head => "the head".to_owned(),
+            Part::Rest => "the rest of the robot".to_owned(),
         }
     }
 
@@ -238,6 +247,7 @@ impl Cell {
         match part {
             Part::Arm(arm) => self.ahead_of_arm(arm),
             Part::Head => vec![self.ahead_of_head()],
+            Part::Rest => vec![self.rest_of_robot()],
         }
     }
 
@@ -250,6 +260,15 @@ impl Cell {
         };
         let (links, courses) = (self.robot.head_links(), vec![turned([here.pan, here.tilt], to)]);
         Theirs::of(Ahead { part: Part::Head, links, courses, beside_m: 0.0, between_m: 0.0 }, ticket)
+    }
+
+    /// The links that no arm and not the head moves, where they are.
+    fn rest_of_robot(&self) -> Theirs {
+        let moved = self.arms.numbers().flat_map(|arm| self.robot.links_of(arm)).chain(self.robot.head_links());
+        let moved: BTreeSet<usize> = moved.collect();
+        let links = (0..self.robot.model.links.len()).filter(|link| !moved.contains(link)).collect();
+        let here = ArmPosition { joints: JointVector::zeros(0), finger: 0.0 };
+        Theirs::of(Ahead { part: Part::Rest, links, courses: vec![vec![here]], beside_m: 0.0, between_m: 0.0 }, None)
     }
 
     /// An arm that stands may have moving fingers: they are then a moving part, and the rest of the arm a standing one.

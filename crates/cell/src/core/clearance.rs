@@ -42,6 +42,8 @@ pub(super) enum Part {
     Arm(usize),
     /// The camera's head. Its joints are pan and tilt, and it has no fingers.
     Head,
+    /// The links that no arm and not the head moves: a mast, a stand.
+    Rest,
 }
 
 /// The remaining work that a comparison may do.
@@ -254,6 +256,7 @@ impl Part {
                 configuration.set_finger(arm, at.finger);
             }
             Part::Head => [configuration.pan, configuration.tilt] = [at.joints[0], at.joints[1]],
+            Part::Rest => {}
         }
     }
 
@@ -261,13 +264,14 @@ impl Part {
         match self {
             Part::Arm(arm) => robot.joints_of(arm),
             Part::Head => robot.head_joints(),
+            Part::Rest => &[],
         }
     }
 
     pub(super) fn finger_links(self, robot: &Robot) -> Vec<usize> {
         match self {
             Part::Arm(arm) => robot.finger_links_of(arm),
-            Part::Head => Vec::new(),
+            Part::Head | Part::Rest => Vec::new(),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Detects that the cell's process did not run for a while. If it was suspended, or got no processor time, the leases of the robot's modules may have
+//! Detects that the cell's process did not run for a while. If it or the machine was suspended, or it got no processor time, the leases of the robot's modules may have
 //! ended meanwhile, and others may hold the modules by now.
 //!
 //! ```text
@@ -8,7 +8,8 @@
 //! ```
 
 use ratn_model::time::Timestamp;
-use std::time::{Duration, Instant};
+use ratn_worker::boot_clock::BootInstant;
+use std::time::Duration;
 
 /// Maximum delay that is accepted: less than the time for which an ended lease keeps a module from its next holder.
 const MOST_MISSED: Duration = Duration::from_secs(2);
@@ -19,8 +20,8 @@ const REST: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub(super) struct Attention {
     /// The time of the last look, in wall time and in the robot's time.
-    last: (Instant, Timestamp),
-    rests_until: Option<Instant>,
+    last: (BootInstant, Timestamp),
+    rests_until: Option<BootInstant>,
 }
 
 /// The result of a look at the clock.
@@ -36,12 +37,12 @@ pub(super) enum Seen {
 
 impl Attention {
     /// The first look.
-    pub(super) fn begins(at: Instant, now: Timestamp) -> Attention {
+    pub(super) fn begins(at: BootInstant, now: Timestamp) -> Attention {
         Attention { last: (at, now), rests_until: None }
     }
 
     /// The next look; since the last one the cell meant to sleep at most `slept`.
-    pub(super) fn looks(&mut self, at: Instant, now: Timestamp, slept: Duration) -> Seen {
+    pub(super) fn looks(&mut self, at: BootInstant, now: Timestamp, slept: Duration) -> Seen {
         let (last, since) = std::mem::replace(&mut self.last, (at, now));
         if at.saturating_duration_since(last) > slept + MOST_MISSED {
             self.rests_until = Some(at + REST);
@@ -62,21 +63,22 @@ impl Attention {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ratn_worker::boot_clock::BootClock;
 
     #[test]
     fn who_looks_too_late_rests_for_a_while_from_the_last_look_on() {
-        let (begin, second) = (Instant::now(), Duration::from_secs(1));
+        let (begin, second) = (BootClock::default().now(), Duration::from_secs(1));
         let robot = |s: f64| Timestamp::from_seconds(s);
         let mut attention = Attention::begins(begin, robot(10.0));
-        assert_eq!(attention.looks(begin + 2 * second, robot(12.0), second), Seen::Nothing);
-        assert_eq!(attention.looks(begin + 6 * second, robot(16.0), second), Seen::Missed(robot(12.0)));
+        assert_eq!(attention.looks(begin + second * 2, robot(12.0), second), Seen::Nothing);
+        assert_eq!(attention.looks(begin + second * 6, robot(16.0), second), Seen::Missed(robot(12.0)));
         assert!(attention.rests());
-        assert_eq!(attention.looks(begin + 13 * second / 2, robot(16.5), second), Seen::Nothing);
+        assert_eq!(attention.looks(begin + second * 13 / 2, robot(16.5), second), Seen::Nothing);
         // The look is late again.
-        assert_eq!(attention.looks(begin + 20 * second, robot(30.0), second), Seen::Missed(robot(16.5)));
-        assert_eq!(attention.looks(begin + 41 * second / 2, robot(30.5), second), Seen::Nothing);
-        assert_eq!(attention.looks(begin + 21 * second, robot(31.0), second), Seen::Rested);
+        assert_eq!(attention.looks(begin + second * 20, robot(30.0), second), Seen::Missed(robot(16.5)));
+        assert_eq!(attention.looks(begin + second * 41 / 2, robot(30.5), second), Seen::Nothing);
+        assert_eq!(attention.looks(begin + second * 21, robot(31.0), second), Seen::Rested);
         assert!(!attention.rests());
-        assert_eq!(attention.looks(begin + 22 * second, robot(32.0), second), Seen::Nothing);
+        assert_eq!(attention.looks(begin + second * 22, robot(32.0), second), Seen::Nothing);
     }
 }

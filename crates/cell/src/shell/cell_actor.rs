@@ -19,6 +19,7 @@ use ratn_motion::robot::Robot;
 use ratn_panic_point::panic_point;
 use ratn_perception::camera::{Camera, DepthImage};
 use ratn_perception::noise::Noise;
+use ratn_worker::boot_clock::BootInstant;
 use ratn_worker::robot_clock::RobotClock;
 use ratn_worker::safety::{Brakes, SafetyState};
 use ratn_worker::vitals::Vitals;
@@ -27,7 +28,7 @@ use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
 use crate::core::objects::TrueObject;
@@ -279,7 +280,7 @@ impl Holds {
 }
 
 fn keep(cell: Cell, recorder: Recorder, clock: RobotClock, inbox: &Receiver<QueuedMessage>, vitals: &Vitals) {
-    let mut keeper = Keeper::begin(cell, recorder, Instant::now(), clock.now());
+    let mut keeper = Keeper::begin(cell, recorder, clock.wall(), clock.now());
     loop {
         vitals.beat();
         panic_point("cell-core");
@@ -289,7 +290,7 @@ fn keep(cell: Cell, recorder: Recorder, clock: RobotClock, inbox: &Receiver<Queu
             Err(RecvTimeoutError::Timeout) => None,
             Err(RecvTimeoutError::Disconnected) => return,
         };
-        keeper.turn(Instant::now(), clock.now(), sleep, message);
+        keeper.turn(clock.wall(), clock.now(), sleep, message);
     }
 }
 
@@ -306,7 +307,7 @@ struct Keeper {
 
 impl Keeper {
     /// Begins at this moment, in wall time and in the robot's time.
-    fn begin(cell: Cell, recorder: Recorder, at: Instant, now: Timestamp) -> Keeper {
+    fn begin(cell: Cell, recorder: Recorder, at: BootInstant, now: Timestamp) -> Keeper {
         let attention = Attention::begins(at, now);
         let (waiting, holds, applying) = Default::default();
         Keeper { cell, recorder, waiting, holds, applying, attention }
@@ -320,7 +321,7 @@ impl Keeper {
     }
 
     /// Handles a message, or a tick without one, at this moment of wall time and of the robot's time; `slept` is how long the thread meant to sleep.
-    fn turn(&mut self, at: Instant, now: Timestamp, slept: Duration, message: Option<Message>) {
+    fn turn(&mut self, at: BootInstant, now: Timestamp, slept: Duration, message: Option<Message>) {
         match self.attention.looks(at, now, slept) {
             Seen::Nothing => {}
             Seen::Missed(since) => {
@@ -429,6 +430,7 @@ mod tests {
     use super::*;
     use crate::config::CellConfig;
     use ratn_motion::aimm;
+    use ratn_worker::boot_clock::BootClock;
 
     #[tokio::test(flavor = "multi_thread")]
     async fn a_stop_and_a_hold_of_an_arm_under_way_are_confirmed_when_it_stands() {
@@ -452,9 +454,28 @@ mod tests {
         }
     }
 
+    #[tokio::test(flavor = "multi_thread")]
+    async fn an_arm_under_way_rests_after_the_machine_was_suspended() {
+        let wall = BootClock::suspendable();
+        let clock = RobotClock::by(wall.clone(), Timestamp(0), 1.0);
+        let handle =
+            start(Cell::new(CellConfig::default()).unwrap(), Recorder::none(), clock, Vitals::default()).unwrap();
+        let _motion = handle.perform(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.2 }).unwrap();
+        let far = |at: &State, from: f64| (at.arm[0] - from).abs() > 0.05;
+        assert!((aimm::OBSERVATION[0] - aimm::HOME[0]).abs() > 0.5);
+        while !far(&handle.state().await.unwrap(), aimm::HOME[0]) {}
+        let before = handle.state().await.unwrap();
+        wall.suspend(Duration::from_secs(60));
+        let [after, later] = [handle.state().await.unwrap(), handle.state().await.unwrap()];
+        assert!(after.now.since(before.now) >= Duration::from_secs(60));
+        assert!(after.arm == later.arm && far(&after, aimm::OBSERVATION[0]), "it has braked, and rests");
+        // Then it goes on.
+        while !far(&handle.state().await.unwrap(), after.arm[0]) {}
+    }
+
     #[test]
     fn what_moved_has_stood_still_while_the_cell_was_suspended_and_goes_on_when_it_is_known_who_holds_it() {
-        let (begin, robot) = (Instant::now(), |ms: u64| Timestamp(0) + Duration::from_millis(ms));
+        let (begin, robot) = (BootClock::default().now(), |ms: u64| Timestamp(0) + Duration::from_millis(ms));
         let mut keeper = Keeper::begin(Cell::new(CellConfig::default()).unwrap(), Recorder::none(), begin, robot(0));
         let request = Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 };
         let (ended, mut ending) = oneshot::channel();

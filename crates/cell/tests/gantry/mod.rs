@@ -108,6 +108,11 @@ pub(crate) fn gantry() -> (Bench, TempDir) {
 /// The same gantries with a head between them in place of the camera above: a stick of 0.5 m at the height of the hands, which pan turns about
 /// x = 0.6, y = 0 from +x over +y. It hangs from the link `parent`.
 pub(crate) fn with_head(parent: &str) -> (Bench, TempDir) {
+    with_head_and(parent, "")
+}
+
+/// The same with more in the URDF.
+pub(crate) fn with_head_and(parent: &str, more: &str) -> (Bench, TempDir) {
     let head = format!(
         "<link name='pan'/><link name='head'><collision><origin xyz='0.25 0 0'/><geometry><box size='0.5 0.02 0.02'/></geometry></collision></link>\
          <link name='lens'/>\
@@ -115,7 +120,7 @@ pub(crate) fn with_head(parent: &str) -> (Bench, TempDir) {
          <limit lower='0' upper='3' effort='1' velocity='0.5' acceleration='2'/></joint>\
          <joint name='tilt' type='revolute'><parent link='pan'/><child link='head'/><axis xyz='0 1 0'/>\
          <limit lower='-0.5' upper='0.5' effort='1' velocity='0.5' acceleration='2'/></joint>\
-         <joint name='lens' type='fixed'><parent link='head'/><child link='lens'/><origin rpy='-1.5707963 0 -1.5707963'/></joint></robot>",
+         <joint name='lens' type='fixed'><parent link='head'/><child link='lens'/><origin rpy='-1.5707963 0 -1.5707963'/></joint>{more}</robot>",
         height = if parent == "world" { 1.5 } else { 0.0 }
     );
     let folder = tempfile::tempdir().unwrap();

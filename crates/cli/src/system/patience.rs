@@ -1,8 +1,9 @@
 //! How long to wait for a starting system: for as long as the missing parts are busy, up to a bound.
 //!
 //! A cell or a worker that reads a robot with many meshes computes for many seconds before it is ready, and for longer on a busy machine. Processor time
-//! tells such a process from one that waits for something that never comes.
+//! that is used, or waited for ([`ratn_daemon::processor_demand`]), tells such a process from one that waits for something that never comes.
 
+use ratn_daemon::processor_demand::of_process;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
@@ -10,13 +11,10 @@ use std::time::{Duration, Instant};
 const IDLE: Duration = Duration::from_secs(30);
 /// Maximum time in all, however busy they are.
 const LONGEST: Duration = Duration::from_secs(600);
-/// A process that has used this much more processor time is busy; an idle one wakes up now and then and uses far less of it in [`IDLE`].
+/// A process that has asked for this much more processor time is busy; an idle one wakes up now and then and asks for far less of it in [`IDLE`].
 const WORK: Duration = Duration::from_secs(1);
 /// Interval at which the missing parts are printed.
 const SAID_EVERY: Duration = Duration::from_secs(10);
-
-/// Unit of processor time in `proc_pid_stat(5)`: Linux shows programs hundredths of a second on every machine.
-const TICK: Duration = Duration::from_millis(10);
 
 /// See the module.
 #[derive(Debug)]
@@ -45,7 +43,7 @@ impl Patience {
         Patience { began: now, worked: now, said: now, counted: BTreeMap::new() }
     }
 
-    /// Checks the processor time that the awaited processes have used so far.
+    /// Checks the processor time that the awaited processes have asked for so far.
     pub(super) fn look(&mut self, now: Instant, used: &BTreeMap<u32, Duration>) -> Verdict {
         for (pid, used) in used {
             let counted = self.counted.entry(*pid).or_default();
@@ -68,33 +66,25 @@ impl Patience {
     }
 }
 
-/// The processor time of some processes, and of all descendants of these and of `parents`.
+/// The processor time that some processes have asked for, and all descendants of these and of `parents`.
 pub(super) fn processor_time(of: &[u32], parents: &[u32]) -> BTreeMap<u32, Duration> {
     let entries = std::fs::read_dir("/proc").into_iter().flatten().flatten();
     let pids = entries.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
-    let all: BTreeMap<u32, (u32, Duration)> = pids.filter_map(|pid| Some((pid, stat(pid)?))).collect();
+    let all: BTreeMap<u32, (Duration, u32)> = pids.filter_map(|pid| Some((pid, of_process(pid)?))).collect();
     let is_below = |pid: u32| {
         // The chain of parents is bounded by the number of processes.
-        let above = std::iter::successors(Some(pid), |pid| all.get(pid).map(|(parent, _)| *parent));
+        let above = std::iter::successors(Some(pid), |pid| all.get(pid).map(|(_, parent)| *parent));
         above.skip(1).take(all.len()).any(|above| of.contains(&above) || parents.contains(&above))
     };
     let counts = all.iter().filter(|(pid, _)| of.contains(pid) || is_below(**pid));
-    counts.map(|(pid, (_, used))| (*pid, *used)).collect()
-}
-
-/// The parent of a process, and its processor time.
-fn stat(pid: u32) -> Option<(u32, Duration)> {
-    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-    // The name in the field before may contain spaces and parentheses.
-    let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
-    let ticks = |field: usize| fields.get(field)?.parse::<u32>().ok();
-    Some((fields.get(1)?.parse().ok()?, TICK * ticks(11)?.checked_add(ticks(12)?)?))
+    counts.map(|(pid, (used, _))| (*pid, *used)).collect()
 }
 
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+    use ratn_daemon::processor_demand::TICK;
 
     /// The result of checking every second a process that uses this percentage of a processor.
     fn after(percent: u32) -> (Duration, &'static str) {

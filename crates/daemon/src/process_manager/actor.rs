@@ -201,6 +201,7 @@ impl Actor {
             let deadline = self.pools.next_deadline().map(|at| self.start + Duration::from_nanos(at.0));
             tokio::select! {
                 Some(outcome) = inputs.events.outcomes.recv() => self.became(outcome),
+                Some(id) = inputs.events.busy.recv() => self.handle(Event::Busy { id }),
                 Some((id, endpoint)) = inputs.events.serving.recv() => {
                     self.processes.serves(&id, &endpoint);
                     self.handle(Event::Serving { id, endpoint });

@@ -14,7 +14,9 @@ use super::roster::{Entry, Intent, Motions, Roster};
 use super::spawner::{self, Job, Outcome};
 use super::template::Template;
 use super::tracking::{Children, Tracker};
+use crate::processor_demand::of_tree;
 use crate::resource_manager;
+use futures::FutureExt;
 use nix::sys::signal::Signal;
 use ratn_model::catalogue::Catalogue;
 use ratn_panic_point::panic_point;
@@ -27,6 +29,7 @@ use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::tls::ClientTls;
 use ratn_worker::unix_socket::SocketAccess;
 use std::collections::BTreeMap;
+use std::convert::Infallible;
 use std::ffi::OsStr;
 use std::io;
 use std::path::PathBuf;
@@ -39,6 +42,9 @@ use tokio_util::task::AbortOnDropHandle;
 /// Capacity for events of processes that the actor has not handled yet.
 const OUTCOMES: usize = 1_024;
 
+/// Longer than the pools wait for a worker.
+const FOR_EVER: Duration = Duration::from_secs(86_400);
+
 /// Interval at which ended orphans are reaped.
 const REAP_INTERVAL: Duration = Duration::from_secs(5);
 
@@ -48,6 +54,8 @@ const HEALTH_OF_WORKER: &str = "the health check of a worker";
 /// Events of the processes.
 pub(super) struct ProcessEvents {
     pub(super) outcomes: mpsc::Receiver<Outcome>,
+    /// The id of each worker that computes while it starts.
+    pub(super) busy: mpsc::Receiver<String>,
     /// The id and the endpoint of each worker that serves.
     pub(super) serving: mpsc::Receiver<(String, String)>,
     /// The id of each worker that got a health check, with the result.
@@ -102,6 +110,7 @@ pub(super) struct Processes {
 
 #[derive(Debug, Clone)]
 struct EventSenders {
+    busy: mpsc::Sender<String>,
     serving: mpsc::Sender<(String, String)>,
     health: mpsc::Sender<(String, Result<(), String>)>,
 }
@@ -113,8 +122,8 @@ struct Process {
     pid: u32,
     /// The worker's template, and the session that it was told offers it, until the roster has them.
     started: Option<(Template, String)>,
-    /// Dropped when the process is known; the readiness check waits for that.
-    known: Option<oneshot::Sender<()>>,
+    /// Gets the process id when it is known; the readiness check waits for that.
+    known: Option<oneshot::Sender<u32>>,
     attended: Option<(AbortHandle, mpsc::Sender<Duration>)>,
 }
 
@@ -147,6 +156,7 @@ impl Processes {
         sockets: &SocketAccess,
     ) -> io::Result<(Processes, ProcessEvents)> {
         let (outcome, outcomes) = mpsc::channel(OUTCOMES);
+        let (busy, computing) = mpsc::channel(OUTCOMES);
         let (serving, served) = mpsc::channel(OUTCOMES);
         let (health, answered) = mpsc::channel(OUTCOMES);
         let processes = Processes {
@@ -168,11 +178,11 @@ impl Processes {
                 AbortOnDropHandle::new(tokio::spawn(exit_on_panic("the reaper of orphans", reap(children))))
             }),
             tracker,
-            senders: EventSenders { serving, health },
+            senders: EventSenders { busy, serving, health },
             by_id: BTreeMap::new(),
             ended_logs: EndedLogs::default(),
         };
-        Ok((processes, ProcessEvents { outcomes, serving: served, health: answered }))
+        Ok((processes, ProcessEvents { outcomes, busy: computing, serving: served, health: answered }))
     }
 
     /// Workers that are started from now on are told that this session offers them.
@@ -289,7 +299,10 @@ impl Processes {
     pub(super) fn spawned(&mut self, id: &str, pid: u32, limits: &str, groups: Vec<PathBuf>) {
         let Some(process) = self.by_id.get_mut(id) else { return };
         process.pid = pid;
-        drop(process.known.take());
+        if let Some(known) = process.known.take() {
+            // The readiness check may have ended.
+            let _ = known.send(pid);
+        }
         if let (Some((template, session)), Some(began)) = (process.started.take(), predecessor::began(pid)) {
             let limits = limits.to_owned();
             let (manager, session) = (Some(self.told.manager.to_string()), Some(session));
@@ -413,19 +426,25 @@ fn notify_socket(directory: &RuntimeDirectory, id: &str) -> PathBuf {
     directory.path().join(format!("{id}.notify"))
 }
 
-/// Reports when a worker is ready, then answers each health check. The pools end a worker that is not ready in time. A small worker
-/// can be ready before its process id is known: the report waits for the id, because the worker's resource names it.
+/// Reports when a worker is ready, then answers each health check; until then, whenever it computes. The pools end a worker that is not ready in
+/// time. A small worker can be ready before its process id is known: the report waits for the id, because the worker's resource names it.
 async fn attend(
     directory: RuntimeDirectory,
     id: String,
     (readiness_check, within, comparison): (ReadinessCheck, Duration, Option<Comparison>),
-    known: oneshot::Receiver<()>,
+    known: oneshot::Receiver<u32>,
     questions: mpsc::Receiver<Duration>,
     senders: EventSenders,
 ) {
-    let (endpoint, health_check) = match readiness_check.ready(&directory, &id, within).await {
+    let known = known.shared();
+    // The pools decide how long it is waited for.
+    let ready = readiness_check.ready(&directory, &id, FOR_EVER);
+    let ready = tokio::select! {
+        ready = ready => ready,
+        never = tell_busy(known.clone(), &id, within, &senders.busy) => match never {},
+    };
+    let (endpoint, health_check) = match ready {
         Ok((endpoint, health_check)) => {
-            // Its sender is dropped when the process id is known.
             let _ = known.await;
             drop(senders.serving.send((id.clone(), endpoint.clone())).await);
             (endpoint, health_check)
@@ -438,6 +457,27 @@ async fn attend(
         }
     };
     tokio::join!(compare, answer(health_check, id.clone(), questions, senders.health));
+}
+
+/// Reports a starting worker each time that it has asked for a thirtieth of a processor since.
+async fn tell_busy(
+    known: impl Future<Output = Result<u32, oneshot::error::RecvError>>,
+    id: &str,
+    within: Duration,
+    busy: &mpsc::Sender<String>,
+) -> Infallible {
+    let Ok(pid) = known.await else { return std::future::pending().await };
+    let mut told = Duration::ZERO;
+    loop {
+        tokio::time::sleep(within / 10).await;
+        let asked_for = of_tree(pid);
+        // A descendant that has ended counts no more.
+        told = told.min(asked_for);
+        if asked_for - told >= within / 30 {
+            told = asked_for;
+            drop(busy.send(id.to_owned()).await);
+        }
+    }
 }
 
 /// Answers each health check of a worker.
@@ -471,14 +511,14 @@ mod tests {
         let seen = Arc::new(Notify::new());
         seen.notify_one();
         let readiness_check = (ReadinessCheck::Line(seen), Duration::from_secs(10), None);
-        let senders = EventSenders { serving, health: mpsc::channel(1).0 };
+        let senders = EventSenders { busy: mpsc::channel(1).0, serving, health: mpsc::channel(1).0 };
         let attended = attend(directory, "w-1@here".to_owned(), readiness_check, is_known, mpsc::channel(1).1, senders);
         let attended = tokio::spawn(attended);
         for _ in 0..100 {
             tokio::task::yield_now().await;
         }
         assert!(served.try_recv().is_err());
-        drop(known);
+        known.send(std::process::id()).unwrap();
         assert_eq!(served.recv().await.unwrap().0, "w-1@here");
         attended.await.unwrap();
     }

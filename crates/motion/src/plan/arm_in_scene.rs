@@ -370,12 +370,17 @@ impl<'a> ArmInScene<'a> {
 
     /// Does the same for the straight motion between two postures and for random postures, after a search without a path or with a path that
     /// collides. Returns whether there are new couples.
-    pub(super) fn doubt_between(&mut self, from: &JointVector, to: &JointVector) -> bool {
-        let is_new = self.search.doubt_between(from, to);
+    pub(super) fn doubt_between(
+        &mut self,
+        from: &JointVector,
+        to: &JointVector,
+        pace: &mut Pace<'_>,
+    ) -> Result<bool, Stop> {
+        let is_new = self.search.doubt_between(from, to, &mut || pace.poll())?;
         if is_new {
             self.look_at_unseen();
         }
-        is_new
+        Ok(is_new)
     }
 
     /// The posture itself if the vector checks find room for it, or else a close one that can be reached from it.

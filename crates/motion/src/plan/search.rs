@@ -13,6 +13,7 @@ use crate::diagnosis::{crowding, of_spheres};
 use crate::exact::{Exact, Touch};
 use crate::joint_vector::JointVector;
 use crate::mechanism::Mechanism;
+use crate::pace::Stop;
 use crate::pairs::drawn;
 use crate::robot::Robot;
 use crate::space::{Obstacle, ROUNDING_M, Space};
@@ -67,34 +68,50 @@ impl<'a> Search<'a> {
     /// Finds couples whose mesh spheres collide in a posture though the shapes do not, and checks them by exact shapes from now on. Returns
     /// whether there are new ones.
     pub(super) fn doubt_at(&mut self, posture: &JointVector) -> bool {
-        let mistaken = self.mistaken(&mut [*posture].into_iter());
-        self.confirm(mistaken)
+        let mistaken = self.mistaken(&[*posture], &mut || Ok(()));
+        mistaken.is_ok_and(|mistaken| self.confirm(mistaken))
     }
 
     /// As `doubt_at`, for the straight motion between two postures and for random postures, after a failed search; also adds the pairs that the
-    /// search skips.
-    pub(super) fn doubt_between(&mut self, from: &JointVector, to: &JointVector) -> bool {
+    /// search skips. `ask` is called before each posture and says whether the caller still wants the plan.
+    ///
+    /// # Errors
+    /// The answer of `ask`.
+    pub(super) fn doubt_between(
+        &mut self,
+        from: &JointVector,
+        to: &JointVector,
+        ask: &mut dyn FnMut() -> Result<(), Stop>,
+    ) -> Result<bool, Stop> {
         let along = (0..=ALONG).map(|i| between(from, to, i as f64 / ALONG as f64));
         let mut random = ChaCha8Rng::seed_from_u64(1);
         let joints = self.robot.arm_joints();
         let drawn = (0..DRAWN).map(|_| JointVector::from_fn(joints.len(), |j| drawn(&joints[j], &mut random)));
-        let mut doubts = self.mistaken(&mut along.chain(drawn));
+        let postures: Vec<JointVector> = along.chain(drawn).collect();
+        let mut doubts = self.mistaken(&postures, ask)?;
         doubts.extend(Couples { pairs: arm::unseen(self.robot, &self.exact), ..Couples::default() });
-        self.confirm(doubts)
+        Ok(self.confirm(doubts))
     }
 
     /// Couples with meshes whose spheres collide in one of these postures though the shapes do not.
-    fn mistaken(&self, postures: &mut dyn Iterator<Item = JointVector>) -> Couples {
+    fn mistaken(&self, postures: &[JointVector], ask: &mut dyn FnMut() -> Result<(), Stop>) -> Result<Couples, Stop> {
         let coarse = of_spheres(&self.seen.arm, ROUNDING_M);
         let obstacles = self.obstacles();
         let coarse = Exact::new(&coarse, surroundings(&obstacles, &self.clouds));
-        let around = surroundings(&self.around, &self.clouds);
-        let mut mistaken = Couples::default();
+        let (mut met, mut all) = (Vec::with_capacity(postures.len()), Couples::default());
         for posture in postures {
-            let met = self.of_meshes(Couples::met(&coarse, &posture));
-            mistaken.extend(Confirmed::new(&self.exact, around, &met, CLEARANCE_M).apart(&met, &posture));
+            ask()?;
+            let here = self.of_meshes(Couples::met(&coarse, posture));
+            all.extend(here.clone());
+            met.push(here);
         }
-        mistaken
+        let exactly = Confirmed::new(&self.exact, surroundings(&self.around, &self.clouds), &all, CLEARANCE_M);
+        let mut mistaken = Couples::default();
+        for (posture, met) in postures.iter().zip(&met) {
+            ask()?;
+            mistaken.extend(exactly.apart(met, posture));
+        }
+        Ok(mistaken)
     }
 
     /// Of the colliding couples those with at least one mesh. An obstacle that is a link of the robot is replaced by that link.
@@ -153,4 +170,31 @@ impl<'a> Search<'a> {
 
 fn surroundings<'s>(obstacles: &'s [Obstacle], clouds: &'s [Cloud]) -> Surroundings<'s> {
     Surroundings { obstacles, clouds, meshes: &[] }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use ratn_model::pose::Pose;
+    use ratn_world::scene::Scene;
+
+    #[test]
+    fn who_no_longer_wants_a_plan_is_not_made_to_wait_for_the_look_at_postures_after_a_search() {
+        let robot = Robot::built_in("panda").unwrap();
+        let nothing = Scene { base: Pose::IDENTITY, objects: Vec::new() };
+        let here = robot.at_zero();
+        let mut search = Search::new(&robot, arm::from_base(&robot, &nothing, &here), Vec::new(), Vec::new());
+        for (allowed, asked_for) in
+            [(usize::MAX, 2 * (ALONG + 1 + DRAWN)), (3, 4), (ALONG + DRAWN + 9, ALONG + DRAWN + 10)]
+        {
+            let mut asked = 0;
+            let doubted = search.doubt_between(&here.arm, &here.arm, &mut || {
+                asked += 1;
+                if asked > allowed { Err(Stop::Cancelled) } else { Ok(()) }
+            });
+            assert_eq!(asked, asked_for);
+            assert_eq!(doubted.is_err(), allowed < usize::MAX);
+        }
+    }
 }

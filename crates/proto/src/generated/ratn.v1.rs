@@ -7777,7 +7777,7 @@ pub struct ClearEmergencyStopRequest {}
 /// The safety state in force now.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ClearEmergencyStopResponse {
-    /// Ready; held if a hold and no emergency stop was in force.
+    /// Ready; held if a hold and no emergency stop was in force, or if a hold was requested during the stop.
     #[prost(message, optional, tag = "1")]
     pub state: ::core::option::Option<SafetyState>,
 }
@@ -7998,7 +7998,8 @@ pub mod safety_service_client {
             self.inner.unary(req, path, codec).await
         }
         /// Hold: pauses every goal under way, and every goal given before GoOn. Deadlines and leases continue to run. It is in force at once. The response
-        /// is sent when nothing moves any more. An emergency stop stays in force, and the response is then that of a stop.
+        /// is sent when nothing moves any more. An emergency stop stays in force, and the response is then that of a stop; the hold follows when the stop
+        /// is cleared.
         pub async fn hold(
             &mut self,
             request: impl tonic::IntoRequest<super::HoldRequest>,
@@ -8102,7 +8103,8 @@ pub mod safety_service_server {
             tonic::Status,
         >;
         /// Hold: pauses every goal under way, and every goal given before GoOn. Deadlines and leases continue to run. It is in force at once. The response
-        /// is sent when nothing moves any more. An emergency stop stays in force, and the response is then that of a stop.
+        /// is sent when nothing moves any more. An emergency stop stays in force, and the response is then that of a stop; the hold follows when the stop
+        /// is cleared.
         async fn hold(
             &self,
             request: tonic::Request<super::HoldRequest>,

@@ -5,7 +5,7 @@
 //!     └────stop──────┴─▶ stopped ──clear──▶ ready
 //! ```
 //! A [`Safety`] is the state of one driver. A stop and a hold are in force at once. They are confirmed to the caller when the driver's
-//! [`Brakes`] have carried them out. (The pure `machine` decides all of that; this module performs its commands.) An
+//! [`Brakes`] have carried them out. A stop ends a hold; a hold that is asked for during a stop is in force when the stop is cleared. (The pure `machine` decides all of that; this module performs its commands.) An
 //! [`crate::action::ActionServer`] with a `Safety` ends every goal with `stopped` while a stop is in force; an action pauses itself with
 //! [`crate::action::GoalContext::while_held`]. A stop that is kept in a file outlasts the process and a reboot.
 //!
@@ -198,7 +198,7 @@ impl Safety {
         self.ask(Question::Stop { reason: reason.to_owned() }).await
     }
 
-    /// Ends an emergency stop. Goals that were stopped do not go on.
+    /// Ends an emergency stop. Goals that were stopped do not go on. The state is `Held` afterwards if a hold was asked for during the stop.
     ///
     /// # Errors
     /// [`SafetyError::Brakes`], and [`SafetyError::Latch`] if the file with the stop cannot be removed: then the stop stays in force.
@@ -209,7 +209,8 @@ impl Safety {
     }
 
     /// Pauses running and new goals until [`Safety::go_on`]. It is in force at once. Returns when nothing moves. A second call asks the
-    /// brakes again, unless they have confirmed. During an emergency stop the stop remains.
+    /// brakes again, unless they have confirmed. During an emergency stop the stop remains in force, and the hold follows when the
+    /// stop is cleared.
     ///
     /// # Errors
     /// [`SafetyError::Brakes`]; while a stop is in force, as [`Safety::stop`].
@@ -387,12 +388,29 @@ mod tests {
         let safety = Safety::default();
         assert_eq!(safety.hold("a look").await, Ok(SafetyState::Held { reason: "a look".into() }));
         assert_eq!(safety.stop("a hand").await, Ok(SafetyState::Stopped { reason: "a hand".into() }));
-        // A second stop, a hold or going on does not change it.
+        // A second stop or going on does not change it.
         assert_eq!(safety.stop("another").await, Ok(SafetyState::Stopped { reason: "a hand".into() }));
-        assert_eq!(safety.hold("a look").await, Ok(SafetyState::Stopped { reason: "a hand".into() }));
         assert_eq!(safety.go_on().await, Err(SafetyError::Stopped { reason: "a hand".into() }));
         assert_eq!(safety.clear().await, Ok(SafetyState::Ready));
         assert_eq!(safety.go_on().await, Ok(SafetyState::Ready));
+    }
+
+    #[tokio::test]
+    async fn a_hold_that_is_asked_for_during_a_stop_is_in_force_when_the_stop_is_cleared() {
+        for file in [None, Some(tempfile::tempdir().unwrap())] {
+            let safety = match &file {
+                None => Safety::default(),
+                Some(place) => Safety::kept_in(place.path().join("stopped"), NoBrakes).await.unwrap(),
+            };
+            safety.stop("a hand").await.unwrap();
+            assert_eq!(safety.hold("a look").await, Ok(SafetyState::Stopped { reason: "a hand".into() }));
+            let held = SafetyState::Held { reason: "a look".into() };
+            assert_eq!((safety.clear().await, safety.state()), (Ok(held.clone()), held));
+            assert_eq!(safety.go_on().await, Ok(SafetyState::Ready));
+            // It is over then.
+            safety.stop("a hand").await.unwrap();
+            assert_eq!(safety.clear().await, Ok(SafetyState::Ready));
+        }
     }
 
     #[tokio::test]

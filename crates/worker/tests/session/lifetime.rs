@@ -102,6 +102,24 @@ async fn a_session_that_was_made_anew_is_known_by_its_number_when_the_answer_tha
 }
 
 #[tokio::test]
+async fn a_session_with_a_new_id_is_no_earlier_process_s_though_the_answer_that_said_so_was_lost() {
+    let (_directory, endpoint) = place();
+    let manager = Manager::new();
+    let _serving = manager.serve(&endpoint).await;
+    for (of_a_new_id, found) in [(true, false), (false, true)] {
+        manager.pool.lock().unwrap().lost_answers = 1;
+        let session = match of_a_new_id {
+            true => Session::open(&channels(), &endpoint, "cell", LONG / 10),
+            // Nobody knows whether a process before it had this session.
+            false => Session::open_as(&channels(), &endpoint, "known".to_owned(), "cell", LONG / 10),
+        };
+        session.alive(LONG).await.unwrap();
+        assert_eq!(manager.pool.lock().unwrap().lost_answers, 0);
+        assert_eq!(session.state().borrow().found, found, "a new id: {of_a_new_id}");
+    }
+}
+
+#[tokio::test]
 async fn a_session_is_over_when_the_machine_wakes_up_after_its_time_to_live_and_goes_on_where_the_manager_knows_it() {
     let (_directory, endpoint) = place();
     let manager = Manager::new();

@@ -1,8 +1,9 @@
 //! A mesh of a link as the judge sees it: its triangles as they are, not the convex pieces that the physics engine uses.
 //!
 //! It touches another shape if a triangle does, or if one is wholly inside the other. The depth is the maximum translation that one triangle, or
-//! one corner, needs to be free: so it is never more than the links need. The exact comparisons are bounded (`MAX_PAIRS`); how many triangles are
-//! passed over before is bounded by the size of the mesh alone.
+//! one corner, needs to be free: so it is never more than the links need. The exact comparisons are bounded (`MAX_PAIRS`), and of two meshes so are
+//! the triangles of one that are searched for in the other (`MAX_SEARCHES`). How many triangles are passed over in one search is bounded by the size
+//! of the mesh alone.
 
 use super::convex::Convex;
 use super::overlap::{Meeting, meeting};
@@ -13,11 +14,15 @@ use rapier3d::parry::partitioning::{Bvh, BvhBuildStrategy};
 use rapier3d::parry::query::PointQuery;
 use rapier3d::parry::shape::SharedShape;
 use ratn_model::pose::Pose;
-use ratn_motion::mesh::Meshed;
+use ratn_motion::mesh::{ConvexPiece, Meshed};
 use ratn_motion::robot::to_f32;
 
 /// Maximum number of triangles near the other shape in one comparison, or of such pairs for two meshes. What is found by then counts.
 const MAX_PAIRS: usize = 4_000;
+
+/// Maximum number of triangles of one mesh for which another mesh is searched in one comparison: those of the mesh with fewer triangles near the
+/// other. What is found by then counts.
+const MAX_SEARCHES: usize = 10_000;
 
 /// Maximum number of corners of a mesh whose depth in another mesh is computed.
 const MAX_CORNERS: usize = 64;
@@ -38,7 +43,7 @@ impl Surface {
     pub(super) fn of(meshed: &Meshed) -> Surface {
         let corner = |corner: &[f64; 3]| Vector(meshed.pose.transform(*corner));
         let point = |at: &[f64; 3]| narrow(corner(at));
-        let hull = |hull: &Vec<[f64; 3]>| SharedShape::convex_hull(&hull.iter().map(point).collect::<Vec<_>>());
+        let hull = |piece: &ConvexPiece| SharedShape::convex_hull(&piece.corners.iter().map(point).collect::<Vec<_>>());
         let hulls = meshed.mesh.pieces().hulls.iter().filter_map(hull).collect();
         let triangles: Vec<[Vector; 3]> =
             meshed.mesh.triangles().iter().map(|triangle| triangle.each_ref().map(corner)).collect();
@@ -114,26 +119,45 @@ impl Surface {
     }
 
     fn meeting_near_surface(&self, at: Pose, other: &Surface, its: Pose, within_m: f64) -> Option<Meeting> {
-        let mut pairs = MAX_PAIRS;
         let [seen, from_there] = [at.inverse().compose(&its), its.inverse().compose(&at)];
         let (theirs, mine) = (moved(&other.tree.root_aabb(), &seen), moved(&self.tree.root_aabb(), &from_there));
-        let near = theirs.loosened((within_m + ROUNDED_M) as f32);
-        let mut found: Option<Meeting> = None;
-        for index in self.tree.intersect_aabb(&near) {
-            if pairs == 0 {
-                break;
-            }
-            let within_m = found.map_or(within_m, |found| -found.depth_m);
-            let met = other.nearest_triangle(its, &self.triangle(index, &at), within_m, &mut pairs);
-            let met = met.map(Meeting::turned);
-            found = found.into_iter().chain(met).reduce(deeper);
-        }
+        let near = [self.near_box(&theirs, &from_there, other, within_m), other.near_box(&mine, &seen, self, within_m)];
+        let found = if near[0].len() <= near[1].len() {
+            self.deepest_of(&near[0], at, other, its, within_m)
+        } else {
+            other.deepest_of(&near[1], its, self, at, within_m).map(Meeting::turned)
+        };
         let do_cross = found.is_some_and(|found| found.depth_m >= 0.0);
         // If no triangles touch, one corner tells whether all are inside.
         let corners = |inside: bool| if do_cross { MAX_CORNERS } else { usize::from(inside) };
         let first = self.deepest_in(&at, other, &its, corners(other.tree.root_aabb().contains(&mine)));
         let second = other.deepest_in(&its, self, &at, corners(self.tree.root_aabb().contains(&theirs)));
         found.into_iter().chain(first).chain(second.map(Meeting::turned)).reduce(deeper)
+    }
+
+    /// Some triangles near the box around another mesh: at most so many as are searched for, and one. `theirs` is that box in the frame of this mesh,
+    /// and `from_there` the pose of this mesh in the frame of the other: a triangle has to be near in both frames.
+    fn near_box(&self, theirs: &Aabb, from_there: &Pose, other: &Surface, within_m: f64) -> Vec<u32> {
+        let more_m = (within_m + ROUNDED_M) as f32;
+        let (near, room) = (theirs.loosened(more_m), other.tree.root_aabb().loosened(more_m));
+        let is_near = |node: &Aabb| node.intersects(&near) && moved(node, from_there).intersects(&room);
+        self.tree.leaves(|node| is_near(&node.aabb())).take(MAX_SEARCHES + 1).collect()
+    }
+
+    /// The contact of the deepest of some of its triangles in another mesh.
+    fn deepest_of(&self, triangles: &[u32], at: Pose, other: &Surface, its: Pose, within_m: f64) -> Option<Meeting> {
+        let mut pairs = MAX_PAIRS;
+        let mut found: Option<Meeting> = None;
+        for index in triangles.iter().take(MAX_SEARCHES) {
+            if pairs == 0 {
+                break;
+            }
+            let within_m = found.map_or(within_m, |found| -found.depth_m);
+            let met = other.nearest_triangle(its, &self.triangle(*index, &at), within_m, &mut pairs);
+            let met = met.map(Meeting::turned);
+            found = found.into_iter().chain(met).reduce(deeper);
+        }
+        found
     }
 
     /// The deepest contact among some of its corners in another mesh.

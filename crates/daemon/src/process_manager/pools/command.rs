@@ -25,6 +25,11 @@ pub enum Event {
         /// Its endpoint.
         endpoint: String,
     },
+    /// A worker that is starting computes: it has asked for processor time since it was last told of.
+    Busy {
+        /// The worker's id.
+        id: String,
+    },
     /// The resource manager has accepted the worker's resource.
     Offered {
         /// The worker's id.

@@ -81,6 +81,9 @@ impl Pools {
             Event::Serving { id, endpoint } => {
                 self.about(now, &id, &mut commands, |pool, number, c| pool.serving(now, number, &endpoint, c));
             }
+            Event::Busy { id } => {
+                self.about(now, &id, &mut commands, |pool, number, _| pool.busy(now, number));
+            }
             Event::Offered { id } => {
                 self.about(now, &id, &mut commands, |pool, number, c| pool.offered(now, number, c));
                 self.let_follow(now, &mut commands);

@@ -274,6 +274,13 @@ impl Pool {
         }
     }
 
+    /// A worker computes while it starts.
+    pub(super) fn busy(&mut self, now: Timestamp, number: u64) {
+        if let Some(worker) = self.workers.get_mut(&number) {
+            worker.busy(now, &self.template);
+        }
+    }
+
     /// A worker's resource was refused.
     pub(super) fn refused(&mut self, now: Timestamp, number: u64, why: &str) {
         if let Some(worker) = self.workers.get_mut(&number) {

@@ -17,6 +17,9 @@ use ratn_model::time::Timestamp;
 use ratn_proto::types::{WorkerState, WorkerStatus};
 use std::time::Duration;
 
+/// Maximum time until a worker is ready that computes all the while, unless its start timeout is longer.
+const LONGEST_START: Duration = Duration::from_secs(600);
+
 #[derive(Debug)]
 pub(super) struct Worker {
     id: String,
@@ -43,8 +46,10 @@ pub(super) struct Worker {
 
 #[derive(Debug, Clone, PartialEq)]
 enum Phase {
+    /// Killed at `until`, which is put off while it computes: up to `last`.
     Starting {
         until: Timestamp,
+        last: Timestamp,
     },
     /// Not offered while an earlier worker's device may still move for its former holder.
     Serving {
@@ -71,7 +76,10 @@ impl Worker {
         Worker {
             id,
             template: template.name.clone(),
-            phase: Phase::Starting { until: now + template.start_timeout() },
+            phase: Phase::Starting {
+                until: now + template.start_timeout(),
+                last: now + template.start_timeout().max(LONGEST_START),
+            },
             serves_since: None,
             idle_since: Some(now),
             liveness: liveness::Liveness::of(template),
@@ -105,6 +113,13 @@ impl Worker {
             Phase::Starting { .. } | Phase::Serving { .. } | Phase::Ready | Phase::Leaving { .. } => {}
         }
         commands.push(Command::Notify(self.status()));
+    }
+
+    /// It computes while it starts: its start timeout begins anew.
+    pub(super) fn busy(&mut self, now: Timestamp, template: &Template) {
+        if let Phase::Starting { until, last } = &mut self.phase {
+            *until = (now + template.start_timeout()).min(*last).max(*until);
+        }
     }
 
     /// It serves, and can be offered; ignored where its start timeout is over.
@@ -256,7 +271,7 @@ impl Worker {
     /// Does what is due.
     pub(super) fn advance(&mut self, now: Timestamp, template: &Template, commands: &mut Vec<Command>) {
         match self.phase {
-            Phase::Starting { until } if until <= now => {
+            Phase::Starting { until, .. } if until <= now => {
                 let Template { start_timeout_s, readiness, .. } = template;
                 let why = format!(
                     "not ready within {start_timeout_s} s: {}; it was started as `{}`, and `ratn logs {}` shows what it wrote",
@@ -295,7 +310,7 @@ impl Worker {
     /// When the passing of time changes something.
     pub(super) fn deadline(&self) -> Option<Timestamp> {
         let of_phase = match self.phase {
-            Phase::Starting { until } => Some(until),
+            Phase::Starting { until, .. } => Some(until),
             Phase::Leaving { until } => until,
             Phase::Stopping { kill_at } => kill_at,
             Phase::Serving { .. } => self.refused.as_ref().map(|(until, _)| *until),

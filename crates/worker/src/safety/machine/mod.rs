@@ -6,6 +6,7 @@
 //!                              │  ▲                                      │               │
 //!                              └──┘ asked again, not confirmed           └─ stop, hold ──┴─▶ brakes applied again
 //! ```
+//! - A hold that is asked for during a stop is kept: it is in force, instead of ready, when the stop is cleared.
 //! - A stop or a hold is in force at once. The brakes, and the disk, follow; the call is confirmed when both have succeeded.
 //! - A repeated call for a stop or a hold repeats whatever is not confirmed.
 //! - A stop or a hold interrupts whatever the brakes are doing for another state. Clearing and going on never do: they are refused until
@@ -92,6 +93,8 @@ pub(super) enum Command {
 pub(super) struct Machine {
     /// The state in force.
     state: SafetyState,
+    /// The reason of a hold that was asked for during the stop in force.
+    hold_follows: Option<String>,
     brakes: BrakesPhase,
     /// `None` if stops are not kept on disk.
     latch: Option<LatchPhase>,
@@ -133,6 +136,7 @@ impl Machine {
     pub(super) fn new(is_kept: bool) -> Machine {
         Machine {
             state: SafetyState::Ready,
+            hold_follows: None,
             brakes: BrakesPhase::Confirmed,
             latch: is_kept.then_some(LatchPhase::NotOnDisk),
             running: BTreeSet::new(),
@@ -178,11 +182,14 @@ impl Machine {
 
     fn asked(&mut self, now: Instant, call: Call, question: Question, commands: &mut Vec<Command>) {
         let wanted = match &question {
-            Question::Clear | Question::GoOn => return self.asked_to_release(call, question, commands),
+            Question::Clear | Question::GoOn => return self.asked_to_release(now, call, question, commands),
             Question::Stop { reason } => Some(SafetyState::Stopped { reason: reason.clone() }),
             Question::Hold { reason } => Some(SafetyState::Held { reason: reason.clone() }),
             Question::Rest => None,
         };
+        if let (Question::Hold { reason }, SafetyState::Stopped { .. }) = (&question, &self.state) {
+            self.hold_follows.get_or_insert_with(|| reason.clone());
+        }
         self.calls.push((call, question));
         match wanted.filter(|wanted| severity(wanted) > severity(&self.state)) {
             Some(state) => {
@@ -207,16 +214,20 @@ impl Machine {
 
     /// Applies the state in force, whatever the brakes are doing.
     fn apply(&mut self, now: Instant, commands: &mut Vec<Command>) {
-        let alone = self.running.is_empty();
-        commands.extend(self.running.iter().map(|&application| Command::Drop { application }));
-        let application = self.begin(self.state.clone(), commands);
-        self.brakes = BrakesPhase::Applying { application, since: now, alone };
+        self.apply_state(now, commands);
         // Callers that wait for a release are refused.
         let refused = match &self.state {
             SafetyState::Stopped { reason } => SafetyError::Stopped { reason: reason.clone() },
             state => SafetyError::NotConfirmed { state: state.clone() },
         };
         self.answer(&Err(refused), commands, |question| matches!(question, Question::Clear | Question::GoOn));
+    }
+
+    fn apply_state(&mut self, now: Instant, commands: &mut Vec<Command>) {
+        let alone = self.running.is_empty();
+        commands.extend(self.running.iter().map(|&application| Command::Drop { application }));
+        let application = self.begin(self.state.clone(), commands);
+        self.brakes = BrakesPhase::Applying { application, since: now, alone };
     }
 
     fn begin(&mut self, state: SafetyState, commands: &mut Vec<Command>) -> Application {
@@ -234,7 +245,7 @@ impl Machine {
         }
     }
 
-    fn asked_to_release(&mut self, call: Call, question: Question, commands: &mut Vec<Command>) {
+    fn asked_to_release(&mut self, now: Instant, call: Call, question: Question, commands: &mut Vec<Command>) {
         let refusal = match (&question, &self.state) {
             // There is nothing to release, unless the brakes failed to release after the start.
             (_, SafetyState::Ready) if !matches!(self.brakes, BrakesPhase::Failed { .. }) => {
@@ -255,7 +266,7 @@ impl Machine {
             // Another caller has begun the release.
             BrakesPhase::Unlatching | BrakesPhase::LettingGo { .. } => {}
             BrakesPhase::Confirmed | BrakesPhase::Failed { .. } if self.running.is_empty() && !is_disk_busy => {
-                self.release(commands);
+                self.release(now, commands);
             }
             _ => {
                 let answer = Err(SafetyError::NotConfirmed { state: self.state.clone() });
@@ -267,14 +278,26 @@ impl Machine {
     }
 
     /// Removes the stop from the disk first; only then may anything move.
-    fn release(&mut self, commands: &mut Vec<Command>) {
+    fn release(&mut self, now: Instant, commands: &mut Vec<Command>) {
         match &mut self.latch {
             Some(latch) if matches!(self.state, SafetyState::Stopped { .. }) => {
                 *latch = LatchPhase::Removing;
                 self.brakes = BrakesPhase::Unlatching;
                 commands.push(Command::RemoveLatch);
             }
-            _ => self.let_go(false, commands),
+            _ => self.cleared(now, commands),
+        }
+    }
+
+    /// Nothing keeps the state in force any more: the brakes are released, or a hold that was asked for during the stop follows.
+    fn cleared(&mut self, now: Instant, commands: &mut Vec<Command>) {
+        match self.hold_follows.take() {
+            Some(reason) => {
+                self.state = SafetyState::Held { reason };
+                commands.push(Command::Show(self.state.clone()));
+                self.apply_state(now, commands);
+            }
+            None => self.let_go(false, commands),
         }
     }
 
@@ -332,7 +355,7 @@ impl Machine {
         // A removal without sync: the file may be there again after a crash, or not.
         self.latch = Some(LatchPhase::NotOnDisk);
         match (&self.brakes, result) {
-            (BrakesPhase::Unlatching, Ok(())) => self.let_go(false, commands),
+            (BrakesPhase::Unlatching, Ok(())) => self.cleared(now, commands),
             (BrakesPhase::Unlatching, Err(reason)) => {
                 self.answer(&Err(SafetyError::Latch(reason)), commands, is_release);
                 self.apply(now, commands);
@@ -367,7 +390,13 @@ impl Machine {
             }
             _ => return,
         };
-        self.answer(&brakes, commands, |question| *question == Question::Rest);
+        let is_held = matches!(self.state, SafetyState::Held { .. });
+        self.answer(&brakes, commands, |question| match question {
+            Question::Rest => true,
+            // The stop is cleared, and a hold has followed.
+            Question::Clear => is_held,
+            _ => false,
+        });
         let latch = match &self.latch {
             Some(latch) if matches!(self.state, SafetyState::Stopped { .. }) => match latch {
                 LatchPhase::OnDisk => Ok(()),

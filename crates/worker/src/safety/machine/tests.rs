@@ -37,6 +37,8 @@ struct Bench {
     writing: Option<bool>,
     on_disk: bool,
     shown: SafetyState,
+    /// A hold was asked for during the stop in force.
+    hold_follows: bool,
     open: BTreeMap<Call, Question>,
     calls: u64,
     releases_asked: u64,
@@ -69,6 +71,7 @@ impl Bench {
             writing: None,
             on_disk: was_stopped,
             shown,
+            hold_follows: false,
             open: BTreeMap::new(),
             calls: 0,
             releases_asked: 0,
@@ -141,9 +144,13 @@ impl Bench {
                 assert_eq!(self.surely, Some(SafetyState::Ready), "ready before the brakes let go: {self:#?}");
                 assert!(!self.on_disk && self.writing.is_none(), "a restart would stop: {self:#?}");
                 assert!(self.releases_asked > 0, "nobody asked for it: {self:#?}");
+                assert!(!self.hold_follows, "a hold is forgotten: {self:#?}");
                 self.shown = SafetyState::Ready;
             }
-            Command::Show(state) => self.shown = state,
+            Command::Show(state) => {
+                self.hold_follows &= matches!(state, SafetyState::Stopped { .. });
+                self.shown = state;
+            }
             Command::Apply { application, state } => {
                 let others = self.running.values_mut().filter(|running| running.state != state);
                 let undisturbed = others.map(|other| other.undisturbed = false).count() == 0;
@@ -180,7 +187,7 @@ impl Bench {
         }
     }
 
-    fn check(&self, step: &Step) {
+    fn check(&mut self, step: &Step) {
         assert_eq!(*self.machine.state(), self.shown, "{self:#?}");
         let is_told = |state: &SafetyState| {
             self.surely.as_ref() == Some(state)
@@ -194,6 +201,7 @@ impl Bench {
             }
             Step::Ask(Question::Hold { .. }) => {
                 assert!(self.shown != SafetyState::Ready && is_told(&self.shown), "{self:#?}");
+                self.hold_follows |= matches!(self.shown, SafetyState::Stopped { .. });
             }
             _ => {}
         }

@@ -88,6 +88,25 @@ fn a_worker_that_does_not_serve_in_time_is_killed_and_counts_as_a_crash() {
 }
 
 #[test]
+fn a_worker_that_computes_while_it_starts_is_waited_for_up_to_a_bound() {
+    let mut pools = pools(|template| template.start_timeout_s = 3.0);
+    let busy = |pools: &mut Rig, s: f64| pools.handle(at(s), Event::Busy { id: "planner-1@compute".into() });
+    pools.take_commands();
+    for second in 1..=598 {
+        busy(&mut pools, f64::from(second));
+        pools.advance(at(f64::from(second)));
+        assert_eq!(pools.next_deadline(), Some(at(f64::from(second + 3).min(600.0))));
+    }
+    assert!(pools.take_commands().is_empty());
+    busy(&mut pools, 599.9);
+    pools.advance(at(600.0));
+    assert_eq!(pools.take_commands(), [Command::Kill { id: "planner-1@compute".into() }]);
+    // It is too late.
+    busy(&mut pools, 600.1);
+    assert_eq!(pools.next_deadline(), None);
+}
+
+#[test]
 fn a_worker_whose_time_was_over_before_its_process_was_there_is_killed_when_it_is() {
     let mut pools = pools(|template| template.start_timeout_s = 3.0);
     pools.advance(at(3.0));
