@@ -40,8 +40,14 @@ def used(case):
 
 
 def by_toppra(case):
-    """The time toppra takes along the path through the knots."""
-    q = np.array([k[1] for k in case["knots"]])
+    """The time toppra takes along the path through the knots, with a stop where all joints stand."""
+    stands = [0, *stops(case), len(case["knots"]) - 1]
+    times = [along_knots(case, case["knots"][first : last + 1]) for first, last in zip(stands, stands[1:])]
+    return None if None in times else sum(times)
+
+
+def along_knots(case, knots):
+    q = np.array([k[1] for k in knots])
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
     keep = np.concatenate([[True], np.diff(along) > 1e-9])
     path = toppra.SplineInterpolator(along[keep], q[keep])
@@ -61,8 +67,13 @@ def by_toppra(case):
 
 
 def by_ruckig(case):
-    """The time ruckig takes along the straight line, within what the joints leave along it."""
-    first, last = np.array(case["knots"][0][1]), np.array(case["knots"][-1][1])
+    """The time ruckig takes along the straight motions from posture to posture, within what the joints leave along each."""
+    path = np.array(case["path"])
+    times = [along_line(case, first, last) for first, last in zip(path, path[1:])]
+    return None if None in times else sum(times)
+
+
+def along_line(case, first, last):
     way = np.linalg.norm(last - first)
     direction = np.abs(last - first) / way
 
@@ -81,30 +92,62 @@ def by_ruckig(case):
     return trajectory.duration if result in (ruckig.Result.Finished, ruckig.Result.Working) else None
 
 
+def stops(case):
+    """The knots between the first and the last at which all joints stand."""
+    v = np.abs(np.array([k[2] for k in case["knots"]]))
+    return [1 + int(i) for i in np.flatnonzero(np.max(v[1:-1], axis=1) < 1e-12)]
+
+
+def duration(case):
+    return case["knots"][-1][0]
+
+
 def summary(cases, reference):
-    ours = [case["knots"][-1][0] for case in cases]
     shares = [used(case) for case in cases]
     out = {
         "cases": len(cases),
-        "mean_s": statistics.mean(ours),
+        "mean_s": statistics.mean(duration(case) for case in cases),
         "made_in_us": statistics.median(case["made_in_us"] for case in cases),
+        "knots": max(len(case["knots"]) for case in cases),
         "greatest_share": {name: max(share[name] for share in shares) for name in shares[0]},
     }
     if reference:
         theirs = [reference(case) for case in cases]
-        ratios = [a / b for a, b in zip(ours, theirs) if b is not None]
-        out["compared"] = len(ratios)
-        out["ratio"] = {"mean": statistics.mean(ratios), "least": min(ratios), "greatest": max(ratios)}
+        out.update(ratios([(duration(case), b) for case, b in zip(cases, theirs) if b is not None]))
+    return out
+
+
+def ratios(pairs):
+    ratios = [a / b for a, b in pairs]
+    values = {"mean": statistics.mean, "median": statistics.median, "least": min, "greatest": max}
+    return {"compared": len(ratios), "ratio": {name: value(ratios) for name, value in values.items()}}
+
+
+def beside_unlimited(limited, unlimited):
+    """The same paths with and without a limit of jerk, by the time without."""
+    pairs = list(zip(limited, unlimited))
+    out = {"more_stops": sum(len(stops(a)) > len(stops(b)) for a, b in pairs)}
+    for name, low, high in [("below 1 s", 0, 1), ("1 to 10 s", 1, 10), ("longer", 10, np.inf)]:
+        some = [(duration(a), duration(b)) for a, b in pairs if low <= duration(b) < high]
+        if some:
+            out[name] = ratios(some)
     return out
 
 
 def main():
     cases = [json.loads(line) for line in sys.stdin]
-    kinds = [("path", by_toppra, "toppra"), ("straight, jerk limited", by_ruckig, "ruckig"), ("path, jerk limited", None, None)]
+    by_kind = {}
+    for case in cases:
+        by_kind.setdefault(case["kind"], []).append(case)
+    peers = {"path": by_toppra, "curve": by_toppra, "straight, jerk limited": by_ruckig, "corners, jerk limited": by_ruckig}
+    names = {by_toppra: "toppra", by_ruckig: "ruckig"}
     report = {name: importlib.metadata.version(name) for name in ("toppra", "ruckig")}
-    for kind, reference, name in kinds:
-        of_kind = [case for case in cases if case["kind"] == kind]
-        report[kind] = {"beside": name, **summary(of_kind, reference)}
+    for kind, cases in by_kind.items():
+        peer = peers.get(kind)
+        report[kind] = {"beside": names.get(peer), **summary(cases, peer)}
+        unlimited = by_kind.get(kind.removesuffix(", jerk limited"))
+        if peer is None and unlimited:
+            report[kind]["beside_no_limit_of_jerk"] = beside_unlimited(cases, unlimited)
     json.dump(report, sys.stdout, indent=2)
     print()
 

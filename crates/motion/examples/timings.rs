@@ -1,5 +1,6 @@
-//! Trajectories to hold against other programs (`scripts/bench-timing`): paths, limits and knots as JSON, a case per line. With a SEED the paths are
-//! others: of 6 to 14 joints, some of which slide, with limits that differ much from joint to joint, and from a milliradian to several turns long.
+//! Trajectories to hold against other programs (`scripts/bench-timing`): paths, limits and knots as JSON, a case per line. Corners are rounded where
+//! nothing says otherwise. With a SEED the paths are others: of 6 to 14 joints, some of which slide, with limits that differ much from joint to joint,
+//! and from a milliradian to several turns long; also followed with a stop at each corner, and curves through many postures.
 
 #![allow(clippy::print_stdout, clippy::unwrap_used, clippy::disallowed_methods, reason = "a measurement")]
 
@@ -9,6 +10,7 @@ use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::Joint;
 use ratn_motion::timing::{Section, timed};
 use serde_json::json;
+use std::f64::consts::TAU;
 use std::ops::Range;
 use std::time::Instant;
 
@@ -18,6 +20,9 @@ const STRAIGHT: u64 = 24;
 
 /// Of the other paths: for each scale.
 const OTHERS: u64 = 12;
+
+/// Postures of a curve.
+const POSTURES: usize = 60;
 
 /// How far the postures of a path are from zero, in radians, or in metres over [`METRES`].
 const SCALES: [f64; 4] = [0.001, 0.03, 1.0, 8.0];
@@ -41,26 +46,26 @@ fn spread(random: &mut ChaCha8Rng, range: Range<f64>) -> f64 {
     random.random_range(range.start.ln()..range.end.ln()).exp()
 }
 
-fn case(kind: &str, joints: &[Joint], path: &[Vec<f64>]) {
+fn case(kind: &str, joints: &[Joint], section: fn(Vec<JointVector>) -> Section, rounds: bool, path: &[Vec<f64>]) {
     let begin = Instant::now();
-    let path = path.iter().map(|q| JointVector::from_fn(q.len(), |j| q[j])).collect();
-    let curve = timed(joints, &[Section::Blended(path)], 1.0, &mut |_, _| true);
+    let postures = path.iter().map(|q| JointVector::from_fn(q.len(), |j| q[j])).collect();
+    let curve = timed(joints, &[section(postures)], 1.0, &mut |_, _| rounds);
     let made_in_us = begin.elapsed().as_micros();
     let knots: Vec<_> = curve.knots().iter().map(|k| json!([k.time_s, k.positions, k.velocities])).collect();
     let of = |limit: fn(&Joint) -> f64| joints.iter().map(limit).collect::<Vec<_>>();
     let jerks: Vec<_> = joints.iter().map(|j| if j.jerk.is_finite() { json!(j.jerk) } else { json!(null) }).collect();
     let line = json!({
         "kind": kind, "velocities": of(|j| j.velocity), "accelerations": of(|j| j.acceleration), "jerks": jerks,
-        "knots": knots, "made_in_us": made_in_us as u64,
+        "path": path, "knots": knots, "made_in_us": made_in_us as u64,
     });
     println!("{line}");
 }
 
 /// With and without a limit of jerk.
-fn both(joints: &[Joint], path: &[Vec<f64>]) {
-    case("path, jerk limited", joints, path);
+fn both(kind: &str, joints: &[Joint], section: fn(Vec<JointVector>) -> Section, path: &[Vec<f64>]) {
+    case(&format!("{kind}, jerk limited"), joints, section, true, path);
     let joints: Vec<Joint> = joints.iter().map(|j| Joint { jerk: f64::INFINITY, ..j.clone() }).collect();
-    case("path", &joints, path);
+    case(kind, &joints, section, true, path);
 }
 
 fn paths(count: usize) {
@@ -70,7 +75,7 @@ fn paths(count: usize) {
         let postures = random.random_range(3..7);
         let mut posture = || (0..count).map(|_| random.random_range(-2.0..2.0)).collect();
         let path: Vec<Vec<f64>> = (0..postures).map(|_| posture()).collect();
-        both(&joints, &path);
+        both("path", &joints, Section::Blended, &path);
     }
 }
 
@@ -81,7 +86,7 @@ fn straight() {
         let reach = if seed % 2 == 0 { 2.0 } else { 0.1 };
         let mut posture = || (0..7).map(|_| random.random_range(-reach..reach)).collect();
         let path: [Vec<f64>; 2] = [posture(), posture()];
-        case("straight, jerk limited", &joints, &path);
+        case("straight, jerk limited", &joints, Section::Blended, true, &path);
     }
 }
 
@@ -101,8 +106,16 @@ fn others(seed: u64) {
         let postures = random.random_range(3..10);
         let mut posture = || scales.iter().map(|scale| random.random_range(-scale..*scale)).collect();
         let path: Vec<Vec<f64>> = (0..postures).map(|_| posture()).collect();
-        both(&joints, &path);
-        case("straight, jerk limited", &joints, &path[..2]);
+        both("path", &joints, Section::Blended, &path);
+        case("straight, jerk limited", &joints, Section::Blended, true, &path[..2]);
+        case("corners, jerk limited", &joints, Section::Blended, false, &path);
+        // Each joint swings around a straight motion, by up to a third of its scale.
+        let swing = |q: f64, share: f64, j: usize| scales[j] * q.sin() / 3.0 * (TAU * share + j as f64).sin();
+        let at = |share: f64| -> Vec<f64> {
+            (0..count).map(|j| path[0][j] + share * (path[1][j] - path[0][j]) + swing(path[2][j], share, j)).collect()
+        };
+        let curve: Vec<Vec<f64>> = (0..POSTURES).map(|i| at(i as f64 / (POSTURES - 1) as f64)).collect();
+        both("curve", &joints, Section::AsGiven, &curve);
     }
 }
 

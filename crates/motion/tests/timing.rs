@@ -155,6 +155,66 @@ fn random_paths_of_any_number_of_joints_keep_within_all_limits_everywhere() {
     check_random::<12>(40..44);
 }
 
+/// The same joints without limits of jerk.
+fn without_jerk(joints: &[Joint]) -> Vec<Joint> {
+    joints.iter().map(|joint| Joint { jerk: f64::INFINITY, ..joint.clone() }).collect()
+}
+
+#[test]
+fn a_motion_of_minutes_within_limits_of_jerk_takes_hardly_longer_than_without_them() {
+    for seed in 0..3 {
+        let mut random = ChaCha8Rng::seed_from_u64(500 + seed);
+        let (mut joints, path) = random_path::<7>(&mut random, 6);
+        // Jerk acts for hundredths of a second; the motion is a thousand times as long.
+        for joint in &mut joints {
+            joint.velocity *= 0.04;
+        }
+        let curve = free(&joints, &path, 1.0);
+        assert_within(&joints, &curve, 1.0);
+        let least = free(&without_jerk(&joints), &path, 1.0).duration_s();
+        assert!(least > 60.0, "{least}");
+        assert!(curve.duration_s() < 1.01 * least, "seed {seed}: {} s, {least} s", curve.duration_s());
+        let knots = curve.knots();
+        let moves = |knot: &Knot| knot.velocities.iter().any(|v| *v != 0.0);
+        assert!(knots[1..knots.len() - 1].iter().all(moves), "seed {seed}: a stop on the way");
+        // Knots are close where the acceleration changes, not in a cruise.
+        assert!(knots.len() < 600, "seed {seed}: {} knots", knots.len());
+    }
+}
+
+#[test]
+fn a_motion_of_any_duration_uses_its_limits_alike() {
+    for seed in 0..3 {
+        let mut random = ChaCha8Rng::seed_from_u64(520 + seed);
+        let (joints, path) = random_path::<6>(&mut random, 4);
+        let alike = free(&joints, &path, 1.0).duration_s();
+        for faster in [0.01_f64, 100.0] {
+            let scaled = |joint: &Joint| Joint {
+                velocity: joint.velocity * faster,
+                acceleration: joint.acceleration * faster.powi(2),
+                jerk: joint.jerk * faster.powi(3),
+                ..joint.clone()
+            };
+            let joints: Vec<Joint> = joints.iter().map(scaled).collect();
+            let duration_s = free(&joints, &path, 1.0).duration_s();
+            assert!((duration_s * faster / alike - 1.0).abs() < 1e-4, "{faster}: {duration_s} s, else {alike} s");
+        }
+    }
+}
+
+#[test]
+fn a_joint_without_a_limit_of_jerk_moves_beside_others_that_have_one() {
+    let limited = [joint(2.0, 4.0, 40.0), joint(2.0, 4.0, 40.0), joint(2.0, 4.0, 40.0)];
+    let mut joints = limited.clone();
+    joints[1].jerk = f64::INFINITY;
+    let path = vectors([[0.0, 0.0, 0.0], [1.0, 0.5, 0.2], [1.5, 1.5, -0.4]]);
+    let curve = free(&joints, &path, 1.0);
+    assert_within(&joints, &curve, 1.0);
+    let [least, most] = [without_jerk(&joints), limited.to_vec()].map(|joints| free(&joints, &path, 1.0).duration_s());
+    assert!(curve.duration_s() <= most * 1.002, "{} s, {least} to {most} s", curve.duration_s());
+    assert!(curve.duration_s() >= least, "{} s, {least} to {most} s", curve.duration_s());
+}
+
 #[test]
 fn with_greater_limits_nothing_takes_longer() {
     for seed in 0..4 {

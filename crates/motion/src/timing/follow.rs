@@ -1,15 +1,16 @@
 //! A path from rest to rest, followed as fast as the limits allow: the knots of its trajectory.
 //!
 //! A straight line is a double S in closed form. Any other path is first timed within velocity and acceleration limits
-//! (`reachability`); where jerk is limited, that gives the mesh for the third order (`third_order`). A cubic spline interpolates the
+//! (`second_order`); where jerk is limited, that gives the mesh (`mesh`) for the third order (`third_order`). A cubic spline interpolates the
 //! path at the points of the mesh, at their times. The spline is the trajectory itself, so its cubics are checked against the limits in
 //! closed form: where one exceeds a limit, that limit is tightened there, and the path is timed again. The remaining excess slows the
 //! whole path, by some thousandths.
 
 use super::cubics;
 use super::double_s::{self, double_s};
-use super::path::{Derivatives, Path, norm};
-use super::reachability::{Grid, squares};
+use super::mesh::mesh;
+use super::path::{Derivatives, Path};
+use super::second_order::Second;
 use super::third_order::{Limits, Mesh, quickest};
 use super::{Speed, Tool};
 use crate::cubic::Cubic;
@@ -28,31 +29,11 @@ pub(crate) struct Bounds<const N: usize> {
     pub(crate) upper: [f64; N],
     tool: Option<Tool>,
     /// How many of the `N` joints the robot has.
-    joints: usize,
+    pub(crate) joints: usize,
 }
-
-/// Minimum number of grid points of the second order on a path and on each of its segments, and maximum change of direction between
-/// neighbouring points, in radians.
-const GRID: f64 = 240.0;
-const GRID_SEGMENT: f64 = 6.0;
-const GRID_TURN: f64 = 0.04;
 
 /// Factors of the grid's density, tried where limits are exceeded between its points.
 const DENSER: [f64; 3] = [2.0, 4.0, 8.0];
-
-/// Time between two knots in seconds; longer where there would be more knots than this.
-const KNOT_S: f64 = 0.018;
-const KNOTS: f64 = 170.0;
-
-/// Maximum change of direction in a cell of the mesh, in radians, and minimum number of cells per segment.
-const TURN: f64 = 0.25;
-const CELLS: f64 = 2.0;
-
-/// Maximum length of a cell as a part of the distance from the start, and likewise to the end.
-const GROWTH: f64 = 0.35;
-
-/// The first cell takes this part of the time in which the acceleration is reached.
-const FIRST: f64 = 0.35;
 
 /// Number of points on a straight line at which the tool's speed is checked, in addition to the first.
 const LINE_PLACES: usize = 64;
@@ -84,7 +65,7 @@ impl<const N: usize> Bounds<N> {
     }
 
     /// Maximum speed along the path at a point, because of the tool's limits.
-    fn fastest(&self, at: &Derivatives<N>) -> f64 {
+    pub(crate) fn fastest(&self, at: &Derivatives<N>) -> f64 {
         let of_joints = |padded: &[f64; N]| JointVector::from_fn(self.joints, |j| padded[j]);
         self.tool.as_ref().map_or(f64::INFINITY, |tool| tool.fastest(&of_joints(&at.position), &of_joints(&at.first)))
     }
@@ -105,7 +86,7 @@ impl<const N: usize> Bounds<N> {
     }
 
     /// The limits along a direction.
-    fn along(&self, direction: &[f64; N]) -> double_s::Limits {
+    pub(crate) fn along(&self, direction: &[f64; N]) -> double_s::Limits {
         let least = |limits: &[f64; N]| {
             let of = |j: usize| limits[j] / direction[j].abs().max(1e-12);
             (0..N).map(of).fold(f64::INFINITY, f64::min)
@@ -146,7 +127,7 @@ fn curved<const N: usize>(
 ) -> Option<Vec<Knot<[f64; N]>>> {
     let second = Second::of(path, bounds, 1.0);
     let knots = match bounds.limits_jerk() {
-        true => third(path, bounds, &second, goes_on),
+        true => third(path, bounds, &second.refined(path, bounds), goes_on),
         false => Some(second_order(path, bounds, second)),
     };
     knots.map(|knots| slowed(knots, bounds))
@@ -160,8 +141,7 @@ pub(crate) fn estimate<const N: usize>(path: &Path<N>, bounds: &Bounds<N>) -> f6
     }
     let second = Second::of(path, bounds, 1.0);
     let limits = bounds.along(&path.segments()[0].at(0.0).first);
-    second.times[second.times.len() - 1]
-        + (limits.acceleration / limits.jerk).min((limits.velocity / limits.jerk).sqrt())
+    second.lasts_s() + (limits.acceleration / limits.jerk).min((limits.velocity / limits.jerk).sqrt())
 }
 
 fn straight<const N: usize>(path: &Path<N>, bounds: &Bounds<N>) -> Vec<Knot<[f64; N]>> {
@@ -174,46 +154,6 @@ fn straight<const N: usize>(path: &Path<N>, bounds: &Bounds<N>) -> Vec<Knot<[f64
         velocities: direction.map(|d| d * i.velocity),
     };
     instants.iter().map(knot).collect()
-}
-
-/// The path timed within limits of velocity and acceleration.
-struct Second<const N: usize> {
-    grid: Grid<N>,
-    squares: Vec<f64>,
-    times: Vec<f64>,
-}
-
-impl<const N: usize> Second<N> {
-    fn of(path: &Path<N>, bounds: &Bounds<N>, density: f64) -> Second<N> {
-        let mut grid = Grid { s: vec![0.0], points: vec![path.segments()[0].at(0.0)] };
-        for (segment, start) in path.segments().iter().zip(path.breaks()) {
-            let share = GRID * segment.length / path.length();
-            let turn = segment.length * segment.sharpest() / GRID_TURN;
-            let count = (share.max(GRID_SEGMENT).max(turn) * density).ceil();
-            for i in 1..=count as usize {
-                let along = segment.length * i as f64 / count;
-                grid.s.push(start + along);
-                grid.points.push(segment.at(along));
-            }
-        }
-        let fastest: Vec<f64> = grid.points.iter().map(|point| bounds.fastest(point)).collect();
-        let squares = squares(&grid, &fastest, &bounds.velocities, &bounds.accelerations);
-        let mut times = vec![0.0];
-        for (i, pair) in squares.windows(2).enumerate() {
-            let mean = (pair[0].sqrt() + pair[1].sqrt()).max(1e-9) / 2.0;
-            times.push(times[i] + (grid.s[i + 1] - grid.s[i]) / mean);
-        }
-        Second { grid, squares, times }
-    }
-
-    fn knots(&self) -> Vec<Knot<[f64; N]>> {
-        let knot = |i: usize| Knot {
-            time_s: self.times[i],
-            positions: self.grid.points[i].position,
-            velocities: self.grid.points[i].first.map(|d| d * self.squares[i].sqrt()),
-        };
-        (0..self.times.len()).map(knot).collect()
-    }
 }
 
 /// The knots on a grid so dense that the limits hold between its points as well, except for a small excess.
@@ -243,7 +183,7 @@ fn third<const N: usize>(
     let mesh = mesh(path, bounds, second);
     let cells = mesh.s.len() - 1;
     let mut limits = Limits {
-        fastest: mesh.ends.iter().map(|ends| ends.each_ref().map(|end| bounds.fastest(end))).collect(),
+        fastest: mesh.cells.iter().map(|cell| cell.each_ref().map(|at| bounds.fastest(at))).collect(),
         velocities: vec![bounds.velocities; cells],
         accelerations: vec![bounds.accelerations; cells],
         jerks: vec![bounds.jerks; cells],
@@ -267,68 +207,6 @@ fn third<const N: usize>(
     best.map(|(_, knots)| knots)
 }
 
-/// The points at which the third order is solved: close in time, closer near rest, and one at the end of each segment.
-fn mesh<const N: usize>(path: &Path<N>, bounds: &Bounds<N>, second: &Second<N>) -> Mesh<N> {
-    let whole = path.length();
-    let lasts = second.times[second.times.len() - 1];
-    let step_s = KNOT_S.max(lasts / KNOTS);
-    let segments = path.segments();
-    let first_way = |slope: &[f64; N], room: f64| {
-        let limits = bounds.along(slope);
-        let by_way = (whole / (2.0 * limits.jerk)).cbrt();
-        let jerking = (limits.acceleration / limits.jerk).min(by_way).min((limits.velocity / limits.jerk).sqrt());
-        (limits.jerk * (FIRST * jerking).powi(3) / 6.0).min(room / 3.0)
-    };
-    let last = &segments[segments.len() - 1];
-    let first = first_way(&segments[0].at(0.0).first, segments[0].length);
-    let end = first_way(&last.at(last.length).first, last.length);
-    let mut s = vec![0.0];
-    let mut ends = vec![[segments[0].at(0.0), segments[0].at(first)]];
-    let mut index = 0;
-    let (squares, grid) = (&second.squares, &second.grid.s);
-    let mut velocity = |at: f64| {
-        while index + 2 < grid.len() && grid[index + 1] < at {
-            index += 1;
-        }
-        let share = (at - grid[index]) / (grid[index + 1] - grid[index]);
-        (squares[index] + share * (squares[index + 1] - squares[index])).max(0.0).sqrt()
-    };
-    for (i, (segment, start)) in segments.iter().zip(path.breaks()).enumerate() {
-        let from = if i == 0 { first } else { start };
-        let to = if i + 1 == segments.len() { whole - end } else { start + segment.length };
-        // The number of cells up to each of many points.
-        let mut counted = vec![(from, 0.0)];
-        let (mut at, mut cells) = (from, 0.0);
-        while at < to {
-            let near = GROWTH * at.min((whole - at).max(end));
-            let here = segment.at(at - start);
-            let near = near.min(TURN * norm(&here.first) / norm(&here.second).max(1e-9));
-            let cell = near.min(velocity(at) * step_s).min(segment.length / CELLS).max(whole * 1e-5);
-            let step = (cell / 6.0).min(to - at).max(whole * 1e-9);
-            at = (at + step).min(to);
-            cells += step / cell;
-            counted.push((at, cells));
-        }
-        let count = cells.ceil().max(2.0) as usize;
-        let mut k = 0;
-        let mut before = from;
-        for c in 1..=count {
-            let wanted = cells * c as f64 / count as f64;
-            while k + 2 < counted.len() && counted[k + 1].1 < wanted {
-                k += 1;
-            }
-            let (a, b) = (counted[k], counted[k + 1]);
-            let here = if c == count { to } else { a.0 + (b.0 - a.0) * (wanted - a.1) / (b.1 - a.1) };
-            s.push(before);
-            ends.push([segment.at(before - start), segment.at(here - start)]);
-            before = here;
-        }
-    }
-    s.extend([whole - end, whole]);
-    ends.push([last.at(last.length - end), last.at(last.length)]);
-    Mesh { s, ends }
-}
-
 /// Times and positions of the knots: all points of the mesh, and additional ones in the first and the last cell.
 fn timed<const N: usize>(path: &Path<N>, mesh: &Mesh<N>, x: &[f64], u: &[f64]) -> (Vec<f64>, Vec<[f64; N]>) {
     let n = mesh.s.len() - 1;
@@ -344,7 +222,7 @@ fn timed<const N: usize>(path: &Path<N>, mesh: &Mesh<N>, x: &[f64], u: &[f64]) -
     }
     for k in 1..n - 1 {
         times.push(times[times.len() - 1] + lasts(cell(k), [x[k], x[k + 1]], [u[k], u[k + 1]]));
-        positions.push(mesh.ends[k][1].position);
+        positions.push(mesh.cells[k][2].position);
     }
     let begins = times[times.len() - 1];
     for i in 1..=FIRST_KNOTS {

@@ -1,18 +1,22 @@
 //! Time parameterization: a path becomes a trajectory within the joints' velocity, acceleration and jerk limits.
 //!
 //! The corners of a blended section are rounded in several ways: each by itself (`blend`), and all together, more or less closely (`spline`). The results
-//! are smooth paths (`path`); the fastest of them is used, or a stop at every corner where that is faster. `follow` times a path. Every section starts
-//! and ends at rest, unless both sections at a seam leave room to pass it without a stop (`seam`) and the whole motion is faster so.
+//! are smooth paths (`path`); the fastest of them is used, or a stop at every corner where that is faster. `follow` times a path: within limits of
+//! velocity and acceleration (`second_order`), and where jerk is limited once more (`third_order`), in cells that are short where acceleration changes
+//! (`mesh`). Every section starts and ends at rest, unless both sections at a seam leave room to pass it without a stop (`seam`) and the whole motion is
+//! faster so.
 
 mod blend;
 mod cubics;
 mod double_s;
 mod follow;
+mod mesh;
 mod path;
 mod reachability;
 mod room;
 pub mod rough;
 mod seam;
+mod second_order;
 mod spline;
 mod third_order;
 
@@ -305,6 +309,8 @@ fn free<const N: usize>(
     let rough = |pieces: &Vec<Path<N>>| pieces.iter().map(|piece| estimate(piece, bounds)).sum::<f64>();
     let mut ranked: Vec<(f64, Vec<Path<N>>)> = candidates.into_iter().map(|c| (rough(&c), c)).collect();
     ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
+    // On a short path several ways to round it are the same.
+    ranked.dedup_by(|a, b| a.0 == b.0);
     let quickest = ranked[0].0;
     for (_, pieces) in ranked.into_iter().filter(|(rough_s, _)| *rough_s < quickest * CLOSE).take(FOLLOWED) {
         let motion = followed(&pieces, bounds, goes_on).filter(|knots| room.holds_motion(knots));

@@ -3,10 +3,10 @@
 //! As in the second order (`reachability`), the unknown is x = ṡ² over s, here as a quadratic spline, so that u = s̈ is continuous and
 //! s⃛ = u′ √x. With the path's derivatives q′, q″, q‴ a joint's acceleration q′ u + q″ x is linear in x and u, and its jerk is √x (q′
 //! u′ + 3 q″ u + q‴ x). So minimising ∫ ds / √x is a convex problem except for the root in 1 / √x ≥ |q′ u′ + 3 q″ u + q‴ x| / J, which
-//! is replaced by its tangent in each step: what satisfies the tangent satisfies the root. It is solved by a logarithmic barrier and
-//! Newton's method (Boyd and Vandenberghe, *Convex Optimization*, chapter 11; Verscheure and others, *Time-Optimal Path Tracking for
-//! Robots: a Convex Optimization Approach*, 2009, for the second order). Every step stays within all limits; the Hessian has five
-//! diagonals, so the time of a step is proportional to the number of points.
+//! is replaced by its tangent in each step: what satisfies the tangent satisfies the root. It is solved by a primal-dual interior-point
+//! method (Boyd and Vandenberghe, *Convex Optimization*, section 11.7; Verscheure and others, *Time-Optimal Path Tracking for Robots: a
+//! Convex Optimization Approach*, 2009, for the second order). Every step stays within all limits; the matrix has five diagonals, so the
+//! time of a step is proportional to the number of points.
 //!
 //! At rest x is not a polynomial of s: in the first and in the last cell s⃛ is constant instead, s = s⃛ t³ / 6, so x = 1.5 u s.
 
@@ -16,15 +16,19 @@ use super::path::Derivatives;
 pub(crate) struct Mesh<const N: usize> {
     /// From 0 to the path's length; at least five points.
     pub(crate) s: Vec<f64>,
-    /// The path's derivatives at the beginning and at the end of each cell, as seen from inside the cell.
-    pub(crate) ends: Vec<[Derivatives<N>; 2]>,
+    /// The path's derivatives at the beginning, in the middle and at the end of each cell, as seen from inside the cell.
+    pub(crate) cells: Vec<[Derivatives<N>; 3]>,
+    /// x in the middle of each cell, without limits of jerk.
+    pub(crate) without_jerk: Vec<f64>,
+    /// The number of joints that move; the others, up to `N`, stand still.
+    pub(crate) joints: usize,
 }
 
 /// Limits of the joints in each cell of a mesh.
 #[derive(Debug, Clone)]
 pub(crate) struct Limits<const N: usize> {
-    /// Maximum of ṡ, at both ends of each cell.
-    pub(crate) fastest: Vec<[f64; 2]>,
+    /// Maximum of ṡ, at the beginning, in the middle and at the end of each cell.
+    pub(crate) fastest: Vec<[f64; 3]>,
     pub(crate) velocities: Vec<[f64; N]>,
     pub(crate) accelerations: Vec<[f64; N]>,
     pub(crate) jerks: Vec<[f64; N]>,
@@ -38,18 +42,28 @@ pub(crate) struct Profile {
     c: Vec<f64>,
 }
 
-/// The weight of time grows by this factor, from the first value to the last.
-const SHARPEN: f64 = 12.0;
-const FIRST_WEIGHT: f64 = 300.0;
-/// The loss through the barrier is about the number of active limits divided by this weight, in seconds.
-const LAST_WEIGHT: f64 = 1.2e5;
-/// Maximum number of Newton steps per weight, and the decrement that ends them.
-const STEPS: usize = 14;
-const DECREMENT: f64 = 2.0;
+/// The part of the duration that may be lost because the search ends.
+const LOSS: f64 = 2e-4;
+/// The duality gap at the beginning, as a part of the duration: of a first search, and of one that starts from another profile.
+const GAPS: [f64; 2] = [1.0, 0.01];
+/// Maximum number of Newton steps.
+const STEPS: usize = 60;
+/// The part of the gap that a step aims at: in the first one, and at least and at most in others, where short steps call for more of it.
+const CENTRING: [f64; 3] = [0.3, 0.05, 0.8];
 /// The part of the limits that the initial profile uses.
 const WITHIN: f64 = 0.9;
 /// Maximum length of a step, as a part of the distance to the nearest limit.
-const SHORT_OF: f64 = 0.97;
+const SHORT_OF: f64 = 0.95;
+
+/// A point at which ṡ is limited and time is counted, with x there as a linear function of three coefficients.
+struct Speed {
+    /// The index of the first of the three coefficients.
+    first: usize,
+    x: [f64; 3],
+    greatest: f64,
+    /// The distance that this point represents, by Simpson's rule.
+    share: f64,
+}
 
 /// One end of a cell, with x, u and u′ there as linear functions of the three coefficients before, at and after the cell.
 struct Place<const N: usize> {
@@ -58,19 +72,27 @@ struct Place<const N: usize> {
     x: [f64; 3],
     u: [f64; 3],
     rise: [f64; 3],
-    path: [[f64; N]; 3],
-    greatest: f64,
-    accelerations: [f64; N],
-    jerks: [f64; N],
-    /// The distance that this end represents: half of the way to its neighbours.
-    share: f64,
+    /// The path's derivatives over the limits of acceleration, and over those of jerk.
+    by_acceleration: [[f64; N]; 2],
+    by_jerk: [[f64; N]; 3],
 }
 
 struct Problem<const N: usize> {
+    speeds: Vec<Speed>,
     places: Vec<Place<N>>,
     coefficients: usize,
     /// The first and the last coefficient as multiples of their neighbours.
     ties: [f64; 2],
+    joints: usize,
+}
+
+/// One value for each limit: its slack, its multiplier, or how fast that changes.
+struct PerLimit<const N: usize> {
+    /// Of the coefficients, which are positive.
+    positive: Vec<f64>,
+    speeds: Vec<f64>,
+    /// Of the acceleration from above and below, and of the jerk.
+    places: Vec<[[f64; 4]; N]>,
 }
 
 /// x, u and u′ at a place.
@@ -86,17 +108,9 @@ pub(crate) fn quickest<const N: usize>(
 ) -> Option<Profile> {
     let problem = Problem::new(mesh, limits);
     let n = mesh.s.len() - 1;
-    let (mut c, mut weight) = match wider {
-        Some(profile) => (problem.within(profile.c.clone())?, LAST_WEIGHT / SHARPEN),
-        None => (problem.within(slow(mesh))?, FIRST_WEIGHT),
-    };
-    loop {
-        problem.centre(&mut c, weight, goes_on)?;
-        if weight >= LAST_WEIGHT {
-            break;
-        }
-        weight *= SHARPEN;
-    }
+    let start = wider.map_or(&mesh.without_jerk[1..n - 1], |profile| &profile.c);
+    let mut c = problem.within(start.to_vec())?;
+    problem.solve(&mut c, GAPS[usize::from(wider.is_some())], goes_on)?;
     let full = problem.full(&c);
     let mut profile = Profile { x: vec![0.0; n + 1], u: vec![0.0; n + 1], c };
     for k in 1..n - 1 {
@@ -106,17 +120,6 @@ pub(crate) fn quickest<const N: usize>(
         }
     }
     Some(profile)
-}
-
-/// The shape of an initial profile, apart from its scale.
-fn slow<const N: usize>(mesh: &Mesh<N>) -> Vec<f64> {
-    let n = mesh.s.len() - 1;
-    let whole = mesh.s[n];
-    let shape = |k: usize| {
-        let s = (mesh.s[k] + mesh.s[k + 1]) / 2.0;
-        (4.0 * s * (whole - s) / (whole * whole)).powf(4.0 / 3.0)
-    };
-    (1..n - 1).map(shape).collect()
 }
 
 impl<const N: usize> Problem<N> {
@@ -129,6 +132,12 @@ impl<const N: usize> Problem<N> {
         let first = cell(0);
         let last = cell(n - 1);
         let ties = [1.0 / (1.0 + cell(1) / (1.5 * first)), 1.0 / (1.0 + cell(n - 2) / (1.5 * last))];
+        // Starting from rest the jerk is about q′ s⃛, and x there follows from s⃛ and the distance.
+        let from_rest = |k: usize, slope: &Derivatives<N>| {
+            let hardest = (0..mesh.joints).map(|j| limits.jerks[k][j] / slope.first[j].abs().max(1e-12));
+            1.5 * cell(k) * (6.0 * cell(k) * hardest.fold(f64::INFINITY, f64::min).powi(2)).cbrt()
+        };
+        let mut speeds: Vec<Speed> = Vec::with_capacity(3 * n);
         let mut places = Vec::with_capacity(2 * n);
         for k in 1..n - 1 {
             // Over the coefficients k − 1, k, k + 1.
@@ -140,35 +149,29 @@ impl<const N: usize> Problem<N> {
             };
             let nodes = [node(k), node(k + 1)];
             let rise = std::array::from_fn(|c| (nodes[1].1[c] - nodes[0].1[c]) / cell(k));
+            let middle = std::array::from_fn(|c| nodes[0].0[c] + cell(k) * (3.0 * nodes[0].1[c] + nodes[1].1[c]) / 4.0);
+            for (i, x) in [nodes[0].0, middle, nodes[1].0].into_iter().enumerate() {
+                let of = |j: usize| limits.velocities[k][j] / mesh.cells[k][i].first[j].abs().max(1e-12);
+                let mut greatest = (0..mesh.joints).map(of).fold(limits.fastest[k][i], f64::min).powi(2);
+                if (k, i) == (1, 0) {
+                    greatest = greatest.min(from_rest(0, &mesh.cells[0][0]));
+                }
+                if (k, i) == (n - 2, 2) {
+                    greatest = greatest.min(from_rest(n - 1, &mesh.cells[n - 1][2]));
+                }
+                speeds.push(Speed { first: k - 1, x, greatest, share: cell(k) * [1.0, 4.0, 1.0][i] / 6.0 });
+            }
             for (end, (x, u)) in nodes.into_iter().enumerate() {
-                let path = &mesh.ends[k][end];
-                let mut greatest = limits.fastest[k][end].powi(2);
-                for j in 0..N {
-                    greatest = greatest.min((limits.velocities[k][j] / path.first[j].abs().max(1e-12)).powi(2));
-                }
-                // Starting from rest the jerk is about q′ s⃛, and x there follows from s⃛ and the distance.
-                for (edge, at, way) in [(1, 0, first), (n - 1, n - 1, last)] {
-                    if k + end == edge {
-                        let slope = &mesh.ends[at][usize::from(at > 0)].first;
-                        let hardest = (0..N).map(|j| limits.jerks[at][j] / slope[j].abs().max(1e-12));
-                        let hardest = hardest.fold(f64::INFINITY, f64::min);
-                        greatest = greatest.min(1.5 * way * (6.0 * way * hardest * hardest).cbrt());
-                    }
-                }
-                places.push(Place {
-                    first: k - 1,
-                    x,
-                    u,
-                    rise,
-                    path: [path.first, path.second, path.third],
-                    greatest,
-                    accelerations: limits.accelerations[k],
-                    jerks: limits.jerks[k],
-                    share: cell(k) / 2.0,
-                });
+                let path = &mesh.cells[k][2 * end];
+                let over =
+                    |derivative: &[f64; N], limits: &[f64; N]| std::array::from_fn(|j| derivative[j] / limits[j]);
+                let (accelerations, jerks) = (&limits.accelerations[k], &limits.jerks[k]);
+                let by_acceleration = [&path.first, &path.second].map(|d| over(d, accelerations));
+                let by_jerk = [&path.first, &path.second, &path.third].map(|d| over(d, jerks));
+                places.push(Place { first: k - 1, x, u, rise, by_acceleration, by_jerk });
             }
         }
-        Problem { places, coefficients: n, ties }
+        Problem { speeds, places, coefficients: n, ties, joints: mesh.joints }
     }
 
     /// All coefficients from the free ones.
@@ -184,144 +187,148 @@ impl<const N: usize> Problem<N> {
     fn within(&self, mut free: Vec<f64>) -> Option<Vec<f64>> {
         let full = self.full(&free);
         let mut scale = f64::INFINITY;
+        for speed in &self.speeds {
+            scale = scale.min(speed.greatest / speed.x(&full));
+        }
         for place in &self.places {
             let triple = place.triple(&full);
-            let x = triple[0];
-            scale = scale.min(place.greatest / x);
-            for j in 0..N {
-                scale = scale.min(place.accelerations[j] / place.acceleration(&triple, j).abs().max(1e-12));
-                let jerk = x.sqrt() * place.jerk(&triple, j).abs();
-                scale = scale.min((place.jerks[j] / jerk.max(1e-12)).powi(2).cbrt());
+            for j in 0..self.joints {
+                scale = scale.min(1.0 / place.acceleration(&triple, j).abs().max(1e-12));
+                let jerk = triple[0].sqrt() * place.jerk(&triple, j).abs();
+                scale = scale.min((1.0 / jerk.max(1e-12)).powi(2).cbrt());
             }
         }
         free.iter_mut().for_each(|c| *c *= (scale * WITHIN).min(1.0));
         (scale > 0.0 && scale.is_finite()).then_some(free)
     }
 
-    /// Newton's method for one weight of time.
-    fn centre(&self, free: &mut [f64], weight: f64, goes_on: &mut dyn FnMut() -> bool) -> Option<()> {
+    /// The duration, except for the first and the last cell.
+    fn lasts_s(&self, full: &[f64]) -> f64 {
+        self.speeds.iter().map(|speed| speed.share / speed.x(full).sqrt()).sum()
+    }
+
+    /// Newton's method for the optimality conditions, whose complementarity is relaxed less from step to step; from a duality gap that is
+    /// this part of the duration.
+    fn solve(&self, free: &mut [f64], gap: f64, goes_on: &mut dyn FnMut() -> bool) -> Option<()> {
         let mut full = self.full(free);
-        let mut merit = self.merit(&full, weight);
+        let count = (full.len() + self.speeds.len() + 4 * self.joints * self.places.len()) as f64;
+        let relaxed = gap * self.lasts_s(&full) / count;
+        let mut multipliers = self.slacks(&full, |slack| relaxed / slack);
+        let mut centring = CENTRING[0];
         for _ in 0..STEPS {
             if !goes_on() {
                 return None;
             }
-            let (gradient, bands) = self.model(&full, weight);
+            let system = self.system(&full, &multipliers);
+            let lasts_s = self.lasts_s(&full);
+            let relaxed = centring * system.gap / count;
+            let gradient: Vec<f64> = system.time.iter().zip(&system.barrier).map(|(t, b)| t + relaxed * b).collect();
+            let (gradient, bands) = self.fold(&gradient, &system.bands);
             let Some(step) = solved(&gradient, bands) else { break };
             let decrement: f64 = -step.iter().zip(&gradient).map(|(d, g)| d * g).sum::<f64>();
-            if decrement < DECREMENT {
+            if system.gap + decrement < LOSS * lasts_s {
                 break;
             }
             let way = self.full(&step);
-            let mut share = SHORT_OF * self.room(&full, &way);
-            let mut moved = false;
-            for _ in 0..12 {
-                let trial: Vec<f64> = full.iter().zip(&way).map(|(c, d)| c + share * d).collect();
-                let value = self.merit(&trial, weight);
-                if value < merit - 1e-4 * share * decrement {
-                    for (c, d) in free.iter_mut().zip(&step) {
-                        *c += share * d;
-                    }
-                    (full, merit, moved) = (trial, value, true);
-                    break;
-                }
-                share /= 3.0;
+            let (changes, shares) = self.changes(&full, &way, &multipliers, relaxed);
+            let [share, of_multipliers] = shares.map(|room| (SHORT_OF * room).min(1.0));
+            for (c, d) in free.iter_mut().zip(&step) {
+                *c += share * d;
             }
-            if !moved {
-                break;
+            for (c, d) in full.iter_mut().zip(&way) {
+                *c += share * d;
             }
+            multipliers.add(of_multipliers, &changes);
+            centring = (1.0 - share.min(of_multipliers)).powi(2).clamp(CENTRING[1], CENTRING[2]);
         }
         Some(())
     }
 
-    /// How far along a step the linear limits allow to go, at most 1.
-    fn room(&self, full: &[f64], way: &[f64]) -> f64 {
-        let mut room = 1.0 / SHORT_OF;
-        for (c, d) in full.iter().zip(way) {
-            if c + room * d < 0.0 {
-                room = -c / d;
-            }
-        }
-        for place in &self.places {
-            let (at, by) = (place.triple(full), place.triple(way));
-            if at[0] + room * by[0] > place.greatest {
-                room = (place.greatest - at[0]) / by[0];
-            }
-            for j in 0..N {
-                let (a, d) = (place.acceleration(&at, j), place.acceleration(&by, j));
-                if (a + room * d).abs() > place.accelerations[j] {
-                    room = (place.accelerations[j] - a * d.signum()) / d.abs();
-                }
-            }
-        }
-        room.max(0.0)
-    }
-
-    /// Weighted time plus barriers; infinite where a limit is broken.
-    fn merit(&self, full: &[f64], weight: f64) -> f64 {
-        let mut sum = 0.0;
-        for c in full {
-            if *c <= 0.0 {
-                return f64::INFINITY;
-            }
-            sum -= c.ln();
-        }
-        for place in &self.places {
+    /// A value for each limit from its slack.
+    fn slacks(&self, full: &[f64], value: impl Fn(f64) -> f64) -> PerLimit<N> {
+        let of = |place: &Place<N>| {
             let triple = place.triple(full);
-            let x = triple[0];
-            if x <= 0.0 {
-                return f64::INFINITY;
-            }
-            let root = 1.0 / x.sqrt();
-            sum += weight * place.share * root;
-            let mut slack = 1.0 - x / place.greatest;
-            if slack <= 0.0 {
-                return f64::INFINITY;
-            }
-            for j in 0..N {
-                let a = place.acceleration(&triple, j) / place.accelerations[j];
-                let jerk = place.jerk(&triple, j) / place.jerks[j];
-                let (hard, harder) = (1.0 - a * a, root * root - jerk * jerk);
-                if hard <= 0.0 || harder <= 0.0 {
-                    return f64::INFINITY;
-                }
-                slack *= hard * harder;
-            }
-            sum -= slack.ln();
+            std::array::from_fn(|j| place.slacks(&triple, j).map(&value))
+        };
+        PerLimit {
+            positive: full.iter().map(|c| value(*c)).collect(),
+            speeds: self.speeds.iter().map(|speed| value(1.0 - speed.x(full) / speed.greatest)).collect(),
+            places: self.places.iter().map(of).collect(),
         }
-        sum
     }
 
-    /// The gradient with respect to the free coefficients, and the diagonals of the convex part of the Hessian: the main one, the
-    /// first and the second beside it.
-    fn model(&self, full: &[f64], weight: f64) -> (Vec<f64>, Vec<[f64; 3]>) {
+    /// The optimality conditions, made linear.
+    fn system(&self, full: &[f64], multipliers: &PerLimit<N>) -> System {
         let count = self.coefficients;
-        let mut gradient = vec![0.0; count];
-        let mut bands = vec![[0.0; 3]; count];
-        for (i, c) in full.iter().enumerate() {
-            gradient[i] -= 1.0 / c;
-            bands[i][0] += 1.0 / (c * c);
+        let mut system =
+            System { time: vec![0.0; count], barrier: vec![0.0; count], bands: vec![[0.0; 3]; count], gap: 0.0 };
+        for (i, (c, multiplier)) in full.iter().zip(&multipliers.positive).enumerate() {
+            system.barrier[i] -= 1.0 / c;
+            system.bands[i][0] += multiplier / c;
+            system.gap += multiplier * c;
         }
-        for place in &self.places {
-            let triple = place.triple(full);
-            let (g, h) = place.model(&triple, weight);
+        for (speed, multiplier) in self.speeds.iter().zip(&multipliers.speeds) {
+            let x = speed.x(full);
+            let slack = 1.0 - x / speed.greatest;
+            let time = speed.share / (x * x * x.sqrt());
+            let bend = multiplier / slack / speed.greatest.powi(2) + 0.75 * time;
+            for a in 0..3 {
+                system.time[speed.first + a] -= speed.x[a] * 0.5 * time * x;
+                system.barrier[speed.first + a] += speed.x[a] / (slack * speed.greatest);
+                for b in a..3 {
+                    system.bands[speed.first + a][b - a] += speed.x[a] * speed.x[b] * bend;
+                }
+            }
+            system.gap += multiplier * slack;
+        }
+        for (place, multipliers) in self.places.iter().zip(&multipliers.places) {
+            let (g, h, gap) = place.model(full, &multipliers[..self.joints]);
+            system.gap += gap;
             // From x, u, u′ to the three coefficients.
             let rows = [&place.x, &place.u, &place.rise];
             for a in 0..3 {
                 let mut mapped = [0.0; 3];
                 for r in 0..3 {
-                    gradient[place.first + a] += rows[r][a] * g[r];
+                    system.barrier[place.first + a] += rows[r][a] * g[r];
                     for q in 0..3 {
                         mapped[q] += rows[r][a] * h[r][q];
                     }
                 }
                 for b in a..3 {
                     let value: f64 = (0..3).map(|q| mapped[q] * rows[q][b]).sum();
-                    bands[place.first + a][b - a] += value;
+                    system.bands[place.first + a][b - a] += value;
                 }
             }
         }
-        self.fold(&gradient, &bands)
+        system
+    }
+
+    /// How the multipliers change along a step, and how much of the step the limits and the multipliers, which are positive, allow.
+    fn changes(&self, full: &[f64], way: &[f64], multipliers: &PerLimit<N>, relaxed: f64) -> (PerLimit<N>, [f64; 2]) {
+        let mut rooms = [f64::INFINITY; 2];
+        let mut change = |slack: f64, by: f64, multiplier: f64| {
+            let change = (relaxed - multiplier * by) / slack - multiplier;
+            rooms = [rooms[0].min(room(slack, by)), rooms[1].min(room(multiplier, change))];
+            change
+        };
+        let positive = (0..full.len()).map(|i| change(full[i], way[i], multipliers.positive[i])).collect();
+        let of_speed = |(speed, multiplier): (&Speed, &f64)| {
+            change(1.0 - speed.x(full) / speed.greatest, -speed.x(way) / speed.greatest, *multiplier)
+        };
+        let speeds = self.speeds.iter().zip(&multipliers.speeds).map(of_speed).collect();
+        let mut places = vec![[[0.0; 4]; N]; self.places.len()];
+        for (i, place) in self.places.iter().enumerate() {
+            let (at, by) = (place.triple(full), place.triple(way));
+            // Along the tangent of the root.
+            let falls = 0.5 * by[0] / (at[0] * at[0].sqrt());
+            for j in 0..self.joints {
+                let slacks = place.slacks(&at, j);
+                let (a, y) = (place.acceleration(&by, j), place.jerk(&by, j));
+                let steps = [-a, a, -falls - y, y - falls];
+                places[i][j] = std::array::from_fn(|k| change(slacks[k], steps[k], multipliers.places[i][j][k]));
+            }
+        }
+        (PerLimit { positive, speeds, places }, rooms)
     }
 
     /// Eliminates the first and the last coefficient, which depend on their neighbours.
@@ -344,60 +351,102 @@ impl<const N: usize> Problem<N> {
     }
 }
 
+/// What a Newton step is made of.
+struct System {
+    /// The gradients of the time and of the logarithmic barrier.
+    time: Vec<f64>,
+    barrier: Vec<f64>,
+    /// The diagonals of the matrix: the main one, the first and the second beside it.
+    bands: Vec<[f64; 3]>,
+    /// The sum of slacks times multipliers.
+    gap: f64,
+}
+
+/// How much of a change a positive value allows.
+fn room(value: f64, change: f64) -> f64 {
+    if change < 0.0 { -value / change } else { f64::INFINITY }
+}
+
+impl<const N: usize> PerLimit<N> {
+    fn add(&mut self, share: f64, changes: &PerLimit<N>) {
+        let pairs = self.positive.iter_mut().zip(&changes.positive).chain(self.speeds.iter_mut().zip(&changes.speeds));
+        let places = self.places.as_flattened_mut().as_flattened_mut().iter_mut();
+        let pairs = pairs.chain(places.zip(changes.places.as_flattened().as_flattened()));
+        pairs.for_each(|(value, change)| *value += share * change);
+    }
+}
+
+/// A linear function of three coefficients.
+fn linear(weights: &[f64; 3], c: &[f64]) -> f64 {
+    weights[0] * c[0] + weights[1] * c[1] + weights[2] * c[2]
+}
+
+impl Speed {
+    fn x(&self, full: &[f64]) -> f64 {
+        linear(&self.x, &full[self.first..])
+    }
+}
+
 impl<const N: usize> Place<N> {
     fn triple(&self, full: &[f64]) -> Triple {
         let c = &full[self.first..self.first + 3];
-        let of = |w: &[f64; 3]| w[0] * c[0] + w[1] * c[1] + w[2] * c[2];
-        [of(&self.x), of(&self.u), of(&self.rise)]
+        [linear(&self.x, c), linear(&self.u, c), linear(&self.rise, c)]
     }
 
+    /// Acceleration over its limit.
     fn acceleration(&self, [x, u, _]: &Triple, j: usize) -> f64 {
-        self.path[0][j] * u + self.path[1][j] * x
+        self.by_acceleration[0][j] * u + self.by_acceleration[1][j] * x
     }
 
-    /// Jerk divided by √x.
+    /// Jerk over its limit and √x.
     fn jerk(&self, [x, u, rise]: &Triple, j: usize) -> f64 {
-        self.path[0][j] * rise + 3.0 * self.path[1][j] * u + self.path[2][j] * x
+        self.by_jerk[0][j] * rise + 3.0 * self.by_jerk[1][j] * u + self.by_jerk[2][j] * x
     }
 
-    /// Gradient and Hessian of weighted time and barriers with respect to x, u, u′.
-    fn model(&self, triple: &Triple, weight: f64) -> (Triple, [Triple; 3]) {
-        let x = triple[0];
-        let root = 1.0 / x.sqrt();
-        let mut g = [-0.5 * weight * self.share * root / x, 0.0, 0.0];
+    /// What is left of the limits of acceleration, from above and below, and of jerk.
+    fn slacks(&self, triple: &Triple, j: usize) -> [f64; 4] {
+        let root = 1.0 / triple[0].sqrt();
+        let (a, y) = (self.acceleration(triple, j), self.jerk(triple, j));
+        [1.0 - a, 1.0 + a, root - y, root + y]
+    }
+
+    /// The barrier's gradient with respect to x, u, u′, the part of the matrix, and the gap.
+    fn model(&self, full: &[f64], multipliers: &[[f64; 4]]) -> (Triple, [Triple; 3], f64) {
+        let triple = self.triple(full);
+        let tangent = 0.5 / (triple[0] * triple[0].sqrt());
+        let mut g = [0.0; 3];
         let mut h = [[0.0; 3]; 3];
-        h[0][0] = 0.75 * weight * self.share * root / (x * x);
-        let slack = 1.0 / (self.greatest - x);
-        g[0] += slack;
-        h[0][0] += slack * slack;
-        for j in 0..N {
-            let [p1, p2, p3] = [self.path[0][j], self.path[1][j], self.path[2][j]];
-            let (a, limit) = (self.acceleration(triple, j), self.accelerations[j]);
-            let (above, below) = (1.0 / (limit - a), 1.0 / (limit + a));
-            let (slope, bend) = (above - below, above * above + below * below);
-            g[0] += slope * p2;
-            g[1] += slope * p1;
+        let mut gap = 0.0;
+        for (j, multipliers) in multipliers.iter().enumerate() {
+            let slacks = self.slacks(&triple, j);
+            let b = slacks.map(|slack| 1.0 / slack);
+            let w: [f64; 4] = std::array::from_fn(|k| multipliers[k] * b[k]);
+            gap += (0..4).map(|k| multipliers[k] * slacks[k]).sum::<f64>();
+            let [p1, p2] = self.by_acceleration.each_ref().map(|d| d[j]);
+            g[0] += (b[0] - b[1]) * p2;
+            g[1] += (b[0] - b[1]) * p1;
+            let bend = w[0] + w[1];
             h[0][0] += bend * p2 * p2;
             h[0][1] += bend * p1 * p2;
             h[1][1] += bend * p1 * p1;
-            let (y, limit) = (self.jerk(triple, j), self.jerks[j]);
-            let tangent = 0.5 * limit * root / x;
-            for (sign, slack) in [(1.0, limit * root - y), (-1.0, limit * root + y)] {
-                // −∇ of the slack, divided by it.
-                let by = 1.0 / slack;
-                let d = [(tangent + sign * p3) * by, 3.0 * sign * p2 * by, sign * p1 * by];
-                for r in 0..3 {
-                    g[r] += d[r];
-                    for q in r..3 {
-                        h[r][q] += d[r] * d[q];
-                    }
+            let [p1, p2, p3] = self.by_jerk.each_ref().map(|d| d[j]);
+            let v = [p3, 3.0 * p2, p1];
+            g[0] += (b[2] + b[3]) * tangent;
+            let (both, apart) = (w[2] + w[3], (w[2] - w[3]) * tangent);
+            h[0][0] += both * tangent * tangent + 2.0 * apart * v[0];
+            h[0][1] += apart * v[1];
+            h[0][2] += apart * v[2];
+            for r in 0..3 {
+                g[r] += (b[2] - b[3]) * v[r];
+                for q in r..3 {
+                    h[r][q] += both * v[r] * v[q];
                 }
             }
         }
         h[1][0] = h[0][1];
         h[2][0] = h[0][2];
         h[2][1] = h[1][2];
-        (g, h)
+        (g, h, gap)
     }
 }
 
