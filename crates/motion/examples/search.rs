@@ -21,9 +21,9 @@ fn main() {
     let problems = Problems::parse(&read(2)).unwrap();
     let mechanism = Mechanism::read(&read(0), Some(&read(1)), &problems.joints).unwrap();
     let budget = Budget { iterations: number(5, 1_000_000), seed: number(6, 1) as u64 };
-    let isa = arguments.get(7).map_or(Isa::detect(), |name| {
-        Isa::available().into_iter().find(|isa| isa.name() == name).unwrap()
-    });
+    let isa = arguments
+        .get(7)
+        .map_or(Isa::detect(), |name| Isa::available().into_iter().find(|isa| isa.name() == name).unwrap());
     let settings = Settings { budget, repetitions: number(3, 1), limit: f64::INFINITY };
     let only = arguments.get(4).filter(|class| !class.is_empty());
     let mut clock = || {
