@@ -1,6 +1,6 @@
 //! Measures search and simplification on the problems of a file, a line per problem:
-//! `cargo run --release -p ratn-motion --example search -- URDF SRDF PROBLEMS [REPEAT [CLASS [ITERATIONS [SEED [WIDTH]]]]]`.
-//! WIDTH is how many postures are checked at once, of what the processor has: 16 (AVX-512) or 8 (AVX2).
+//! `cargo run --release -p ratn-motion --example search -- URDF SRDF PROBLEMS [REPEAT [CLASS [ITERATIONS [SEED [ISA]]]]]`.
+//! ISA is the instruction set, of what the processor has: `avx512`, `avx2`, `neon` or `plain`.
 //!
 //! Each line: class, index, outcome, search and simplification in µs of processor time (the least of all repetitions), samples drawn, length
 //! before and after simplification, and what the exact shapes reject. `scripts/search/compare.py` puts VAMP beside it.
@@ -21,8 +21,9 @@ fn main() {
     let problems = Problems::parse(&read(2)).unwrap();
     let mechanism = Mechanism::read(&read(0), Some(&read(1)), &problems.joints).unwrap();
     let budget = Budget { iterations: number(5, 1_000_000), seed: number(6, 1) as u64 };
-    let width = number(7, Isa::detect().width());
-    let isa = Isa::available().into_iter().find(|isa| isa.width() == width).unwrap();
+    let isa = arguments
+        .get(7)
+        .map_or(Isa::detect(), |name| Isa::available().into_iter().find(|isa| isa.name() == name).unwrap());
     let settings = Settings { budget, repetitions: number(3, 1), limit: f64::INFINITY };
     let only = arguments.get(4).filter(|class| !class.is_empty());
     let mut clock = || {

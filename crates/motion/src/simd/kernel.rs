@@ -392,46 +392,35 @@ fn sin_cos<V: Lanes>(x: V) -> (V, V) {
 fn kinematics<V: Lanes>(compiled: &Compiled, postures: &impl Postures<V>, scratch: &mut Scratch) {
     scratch.batch += 1;
     for (index, frame) in compiled.frames.iter().enumerate() {
-        let parent = &scratch.frames[frame.parent];
+        let (known, new) = scratch.frames.split_at_mut(index + 1);
+        let (parent, place) = (&known[frame.parent], &mut new[0]);
         let o = &frame.origin;
-        let mut r: [V; 9] = [V::splat(0.0); 9];
-        let mut t: [V; 3] = [V::splat(0.0); 3];
-        if frame.parent == 0 {
-            for (to, from) in r.iter_mut().chain(&mut t).zip(o) {
-                *to = V::splat(*from);
-            }
-        } else {
-            for row in 0..3 {
-                let p = [V::load(&parent[3 * row]), V::load(&parent[3 * row + 1]), V::load(&parent[3 * row + 2])];
-                for column in 0..3 {
-                    let first = p[0].mul(V::splat(o[column]));
-                    let second = p[1].mul_add(V::splat(o[3 + column]), first);
-                    r[3 * row + column] = p[2].mul_add(V::splat(o[6 + column]), second);
-                }
-                let moved = p[0].mul_add(V::splat(o[9]), V::load(&parent[9 + row]));
-                t[row] = p[2].mul_add(V::splat(o[11]), p[1].mul_add(V::splat(o[10]), moved));
-            }
-        }
         let q = postures.position(frame.joint, frame.factor);
-        if frame.slides {
-            for row in 0..3 {
-                t[row] = r[3 * row + 2].mul_add(q, t[row]);
+        let (s, c) = if frame.slides { (V::splat(0.0), V::splat(1.0)) } else { sin_cos(q) };
+        let minus = V::splat(0.0).sub(s);
+        // Row by row, so that what is computed stays in registers.
+        for row in 0..3 {
+            let (mut x, mut y, z, mut t);
+            if frame.parent == 0 {
+                (x, y) = (V::splat(o[3 * row]), V::splat(o[3 * row + 1]));
+                (z, t) = (V::splat(o[3 * row + 2]), V::splat(o[9 + row]));
+            } else {
+                let p = [V::load(&parent[3 * row]), V::load(&parent[3 * row + 1]), V::load(&parent[3 * row + 2])];
+                x = p[2].mul_add(V::splat(o[6]), p[1].mul_add(V::splat(o[3]), p[0].mul(V::splat(o[0]))));
+                y = p[2].mul_add(V::splat(o[7]), p[1].mul_add(V::splat(o[4]), p[0].mul(V::splat(o[1]))));
+                z = p[2].mul_add(V::splat(o[8]), p[1].mul_add(V::splat(o[5]), p[0].mul(V::splat(o[2]))));
+                let moved = p[0].mul_add(V::splat(o[9]), V::load(&parent[9 + row]));
+                t = p[2].mul_add(V::splat(o[11]), p[1].mul_add(V::splat(o[10]), moved));
             }
-        } else {
-            let (s, c) = sin_cos(q);
-            let minus = V::splat(0.0).sub(s);
-            for row in 0..3 {
-                let (x, y) = (r[3 * row], r[3 * row + 1]);
-                r[3 * row] = x.mul_add(c, y.mul(s));
-                r[3 * row + 1] = y.mul_add(c, x.mul(minus));
+            if frame.slides {
+                t = z.mul_add(q, t);
+            } else {
+                (x, y) = (x.mul_add(c, y.mul(s)), y.mul_add(c, x.mul(minus)));
             }
-        }
-        let place = &mut scratch.frames[index + 1];
-        for i in 0..9 {
-            r[i].store(&mut place[i]);
-        }
-        for i in 0..3 {
-            t[i].store(&mut place[9 + i]);
+            x.store(&mut place[3 * row]);
+            y.store(&mut place[3 * row + 1]);
+            z.store(&mut place[3 * row + 2]);
+            t.store(&mut place[9 + row]);
         }
     }
 }

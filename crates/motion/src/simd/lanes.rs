@@ -91,13 +91,26 @@ impl Isa {
         all
     }
 
+    /// Its name in lower case: `avx512`, `avx2`, `neon`, or `plain` for the scalar one.
+    pub fn name(self) -> &'static str {
+        match self.0 {
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx512 => "avx512",
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx2 => "avx2",
+            #[cfg(target_arch = "aarch64")]
+            Kind::Neon => "neon",
+            Kind::Plain => "plain",
+        }
+    }
+
     /// Number of configurations that are checked at once.
     pub fn width(self) -> usize {
         match self.0 {
             #[cfg(target_arch = "x86_64")]
             Kind::Avx512 => 16,
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx2 => 8,
+            Kind::Avx2 => 16,
             #[cfg(target_arch = "aarch64")]
             Kind::Neon => 8,
             Kind::Plain => 8,
@@ -223,7 +236,7 @@ fn is_free_avx512(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
 fn is_free_avx2(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
-    sweep::is_free::<x86::Wide8>(edge, scratch)
+    sweep::is_free::<x86::Pair>(edge, scratch)
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -235,7 +248,7 @@ fn near_avx512(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
 fn near_avx2(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
-    sweep::near::<x86::Wide8>(edge, scratch)
+    sweep::near::<x86::Pair>(edge, scratch)
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -247,7 +260,7 @@ fn touching_again_avx512(compiled: &Compiled, positions: &[Block], count: usize,
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
 fn touching_again_avx2(compiled: &Compiled, positions: &[Block], count: usize, scratch: &mut Scratch) -> u32 {
-    sweep::touching_again::<x86::Wide8>(compiled, positions, count, scratch)
+    sweep::touching_again::<x86::Pair>(compiled, positions, count, scratch)
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -259,7 +272,7 @@ fn nearest_each_avx512(blocks: &[Block], states: &[[f32; 16]], to: &[Block], fou
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
 fn nearest_each_avx2(blocks: &[Block], states: &[[f32; 16]], to: &[Block], found: &mut [u32; 16]) {
-    nearest::nearest_each::<x86::Wide8>(blocks, states, to, found);
+    nearest::nearest_each::<x86::Pair>(blocks, states, to, found);
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -271,7 +284,7 @@ fn fill_cloud_avx512(cloud: &mut Cloud, points: &[[Block; 3]], reach: f32) {
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
 fn fill_cloud_avx2(cloud: &mut Cloud, points: &[[Block; 3]], reach: f32) {
-    cloud::fill::<x86::Wide8>(cloud, points, reach);
+    cloud::fill::<x86::Pair>(cloud, points, reach);
 }
 
 #[cfg(target_arch = "aarch64")]
@@ -289,7 +302,7 @@ fn nearest_avx512(blocks: &[Block], dimensions: usize, to: &[f32; 16]) -> usize 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
 fn nearest_avx2(blocks: &[Block], dimensions: usize, to: &[f32; 16]) -> usize {
-    nearest::nearest::<x86::Wide8>(blocks, dimensions, to)
+    nearest::nearest::<x86::Pair>(blocks, dimensions, to)
 }
 
 #[cfg(target_arch = "aarch64")]
@@ -489,63 +502,80 @@ mod x86 {
         }
     }
 
+    /// Sixteen numbers in two registers: as many as in one of AVX-512, so that what a batch costs besides its vectors is paid for sixteen postures.
     #[derive(Clone, Copy)]
-    pub(super) struct Wide8(__m256);
+    pub(super) struct Pair(__m256, __m256);
 
-    impl Lanes for Wide8 {
-        const WIDTH: usize = 8;
+    impl Pair {
+        /// The lane-wise maximum of both registers.
+        #[inline(always)]
+        fn halved(self) -> __m256 {
+            unsafe { _mm256_max_ps(self.0, self.1) }
+        }
+    }
+
+    impl Lanes for Pair {
+        const WIDTH: usize = 16;
         #[inline(always)]
         fn splat(value: f32) -> Self {
-            Wide8(unsafe { _mm256_set1_ps(value) })
+            let eight = unsafe { _mm256_set1_ps(value) };
+            Pair(eight, eight)
         }
         #[inline(always)]
         fn load(block: &Block) -> Self {
-            Wide8(unsafe { _mm256_load_ps(block.0.as_ptr()) })
+            let first = block.0.as_ptr();
+            Pair(unsafe { _mm256_load_ps(first) }, unsafe { _mm256_load_ps(first.add(8)) })
         }
         #[inline(always)]
-        fn load_part(block: &Block, part: usize) -> Self {
-            Wide8(unsafe { _mm256_load_ps(block.0.as_ptr().add(8 * (part & 1))) })
+        fn load_part(block: &Block, _: usize) -> Self {
+            Self::load(block)
         }
         #[inline(always)]
         fn store(self, block: &mut Block) {
-            unsafe { _mm256_store_ps(block.0.as_mut_ptr(), self.0) }
+            let first = block.0.as_mut_ptr();
+            unsafe { _mm256_store_ps(first, self.0) };
+            unsafe { _mm256_store_ps(first.add(8), self.1) }
         }
         #[inline(always)]
         fn add(self, other: Self) -> Self {
-            Wide8(unsafe { _mm256_add_ps(self.0, other.0) })
+            Pair(unsafe { _mm256_add_ps(self.0, other.0) }, unsafe { _mm256_add_ps(self.1, other.1) })
         }
         #[inline(always)]
         fn sub(self, other: Self) -> Self {
-            Wide8(unsafe { _mm256_sub_ps(self.0, other.0) })
+            Pair(unsafe { _mm256_sub_ps(self.0, other.0) }, unsafe { _mm256_sub_ps(self.1, other.1) })
         }
         #[inline(always)]
         fn mul(self, other: Self) -> Self {
-            Wide8(unsafe { _mm256_mul_ps(self.0, other.0) })
+            Pair(unsafe { _mm256_mul_ps(self.0, other.0) }, unsafe { _mm256_mul_ps(self.1, other.1) })
         }
         #[inline(always)]
         fn mul_add(self, factor: Self, term: Self) -> Self {
-            Wide8(unsafe { _mm256_fmadd_ps(self.0, factor.0, term.0) })
+            let low = unsafe { _mm256_fmadd_ps(self.0, factor.0, term.0) };
+            Pair(low, unsafe { _mm256_fmadd_ps(self.1, factor.1, term.1) })
         }
         #[inline(always)]
         fn max(self, other: Self) -> Self {
-            Wide8(unsafe { _mm256_max_ps(self.0, other.0) })
+            Pair(unsafe { _mm256_max_ps(self.0, other.0) }, unsafe { _mm256_max_ps(self.1, other.1) })
         }
         #[inline(always)]
         fn min(self, other: Self) -> Self {
-            Wide8(unsafe { _mm256_min_ps(self.0, other.0) })
+            Pair(unsafe { _mm256_min_ps(self.0, other.0) }, unsafe { _mm256_min_ps(self.1, other.1) })
         }
         #[inline(always)]
         fn sqrt(self) -> Self {
-            Wide8(unsafe { _mm256_sqrt_ps(self.0) })
+            Pair(unsafe { _mm256_sqrt_ps(self.0) }, unsafe { _mm256_sqrt_ps(self.1) })
         }
         #[inline(always)]
         fn below(self, other: Self) -> u32 {
-            (unsafe { _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LT_OQ>(self.0, other.0)) }) as u32
+            let low = unsafe { _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LT_OQ>(self.0, other.0)) };
+            let high = unsafe { _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LT_OQ>(self.1, other.1)) };
+            (low | high << 8) as u32
         }
         #[inline(always)]
         fn peak(self) -> f32 {
             unsafe {
-                let four = _mm_max_ps(_mm256_castps256_ps128(self.0), _mm256_extractf128_ps::<1>(self.0));
+                let eight = self.halved();
+                let four = _mm_max_ps(_mm256_castps256_ps128(eight), _mm256_extractf128_ps::<1>(eight));
                 let two = _mm_max_ps(four, _mm_movehl_ps(four, four));
                 _mm_cvtss_f32(_mm_max_ss(two, _mm_movehdup_ps(two)))
             }
@@ -553,15 +583,17 @@ mod x86 {
         #[inline(always)]
         fn peaks(six: [Self; 6]) -> [f32; 8] {
             let [a, b, c, d, e, f] = six;
-            unsafe { peaks([a.0, b.0, c.0, d.0, e.0, f.0]) }
+            unsafe { peaks([a.halved(), b.halved(), c.halved(), d.halved(), e.halved(), f.halved()]) }
         }
         #[inline(always)]
         fn choose_below(self, other: Self, yes: Self, no: Self) -> Self {
-            Wide8(unsafe { _mm256_blendv_ps(no.0, yes.0, _mm256_cmp_ps::<_CMP_LT_OQ>(self.0, other.0)) })
+            let low = unsafe { _mm256_blendv_ps(no.0, yes.0, _mm256_cmp_ps::<_CMP_LT_OQ>(self.0, other.0)) };
+            Pair(low, unsafe { _mm256_blendv_ps(no.1, yes.1, _mm256_cmp_ps::<_CMP_LT_OQ>(self.1, other.1)) })
         }
         #[inline(always)]
         fn abs(self) -> Self {
-            Wide8(unsafe { _mm256_andnot_ps(_mm256_set1_ps(-0.0), self.0) })
+            let sign = unsafe { _mm256_set1_ps(-0.0) };
+            Pair(unsafe { _mm256_andnot_ps(sign, self.0) }, unsafe { _mm256_andnot_ps(sign, self.1) })
         }
     }
 }
@@ -676,7 +708,7 @@ mod tests {
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
     fn peaks_avx2() -> [f32; 8] {
-        peaks::<x86::Wide8>()
+        peaks::<x86::Pair>()
     }
 
     #[test]
