@@ -329,8 +329,12 @@ proptest! {
                     }
                 }
                 Step::Revoke(index) => {
-                    if let Some(lease) = model.leases.keys().nth(index).copied() {
-                        pool.release(at, None, lease).unwrap();
+                    if let Some((lease, (session, _))) = model.leases.iter().nth(index).map(|(id, lease)| (*id, *lease)) {
+                        // By another, or by a holder that does not know whether something still moves.
+                        match index % 2 {
+                            0 => pool.release(at, None, lease).unwrap(),
+                            _ => pool.release_moving(at, Some(&names[session]), lease).unwrap(),
+                        }
                         model.revoke(lease, now);
                     }
                 }
