@@ -69,7 +69,8 @@ impl Holder {
     async fn release(&mut self, lease_id: u64) -> anyhow::Result<()> {
         let request_id = format!("release-{lease_id}");
         let session_id = "holder".to_owned();
-        let release = v1::ResourceServiceReleaseRequest { request_id, session_id, lease_id, note: String::new() };
+        let release =
+            v1::ResourceServiceReleaseRequest { request_id, session_id, lease_id, note: String::new(), at_rest: true };
         ensure!(self.resources.release(release).await?.into_inner().released);
         Ok(())
     }

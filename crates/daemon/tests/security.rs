@@ -315,6 +315,7 @@ async fn over_tls_a_certificate_is_who_one_is_and_nobody_touches_what_is_another
         session_id: "s".into(),
         lease_id: lease.id,
         note: String::new(),
+        at_rest: true,
     };
     let sessionless = v1::ResourceServiceReleaseRequest { session_id: String::new(), ..release.clone() };
     for refused in [

@@ -92,6 +92,7 @@ async fn answers_come_as_they_are_there_and_not_in_the_order_of_questions() {
         session_id: "b".to_owned(),
         lease_id,
         note: String::new(),
+        at_rest: true,
     };
     line.ask(4, Some(Asked::Release(give_back))).await;
     let mut answers = BTreeMap::new();

@@ -141,11 +141,15 @@ fn wait<T: Send>(py: Python<'_>, runtime: &OwnRuntime, work: impl Future<Output 
     }
 }
 
+/// Whether a `with` block ends by an exception.
+fn has_raised(exception: &Bound<'_, PyTuple>) -> bool {
+    exception.get_item(0).is_ok_and(|kind| !kind.is_none())
+}
+
 /// The end of a `with` block: an exception raised inside has priority.
 fn left(released: PyResult<bool>, exception: &Bound<'_, PyTuple>) -> PyResult<bool> {
-    let has_raised = exception.get_item(0).is_ok_and(|kind| !kind.is_none());
     match released {
-        Err(error) if has_raised => beside(exception.py(), error).map(|()| false),
+        Err(error) if has_raised(exception) => beside(exception.py(), error).map(|()| false),
         released => released.map(|_| false),
     }
 }
@@ -285,7 +289,7 @@ impl Client {
             Ok((base, id)) => Ok(Projected { base: base.0, id, lease, world: self.world.clone() }),
             Err(error) => {
                 // The first error is the one to report; otherwise the lease ends with the session.
-                lease.release(py).map(drop).or_else(|lost| beside(py, lost))?;
+                lease.release(py, true).map(drop).or_else(|lost| beside(py, lost))?;
                 Err(error)
             }
         }
@@ -364,9 +368,12 @@ impl Lease {
         state.alive && state.generation == self.generation
     }
 
-    /// Releases the resources; false if the lease had ended before.
-    fn release(&self, py: Python<'_>) -> PyResult<bool> {
-        wait_for(py, &self.runtime, self.held.client.release(self.granted.id))
+    /// Releases the resources; false if the lease had ended before. Unless they are known to be `at_rest`, what moves is granted again when its driver
+    /// has confirmed standstill, or when its `standstill_ms` has passed; so it is where an exception ends the `with` block.
+    #[pyo3(signature = (*, at_rest = true))]
+    fn release(&self, py: Python<'_>, at_rest: bool) -> PyResult<bool> {
+        let released = self.held.client.release_with_note(self.granted.id, String::new(), at_rest);
+        wait_for(py, &self.runtime, released)
     }
 
     fn __enter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
@@ -375,7 +382,7 @@ impl Lease {
 
     #[pyo3(signature = (*_exception))]
     fn __exit__(&self, py: Python<'_>, _exception: &Bound<'_, PyTuple>) -> PyResult<bool> {
-        left(self.release(py), _exception)
+        left(self.release(py, !has_raised(_exception)), _exception)
     }
 
     fn __repr__(&self) -> String {
@@ -411,7 +418,7 @@ impl Projected {
     /// Ends the projection and releases its resource; false if it had ended before.
     fn release(&self, py: Python<'_>) -> PyResult<bool> {
         let released = wait_for(py, &self.lease.runtime, self.world.release(self.id));
-        self.lease.release(py)?;
+        self.lease.release(py, true)?;
         released
     }
 

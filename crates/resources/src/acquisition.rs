@@ -90,12 +90,36 @@ impl Pool {
     /// # Errors
     /// An unknown or ended lease, or one of another session.
     pub fn release(&mut self, now: Timestamp, session: Option<&SessionId>, id: LeaseId) -> Result<(), PoolError> {
+        self.give_back(now, session, id, EndReason::Asked)
+    }
+
+    /// As [`Pool::release`], by a holder that does not know whether something still moves for the lease: units with a bound for standstill are free
+    /// when that is confirmed, or the bound has passed.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn release_moving(
+        &mut self,
+        now: Timestamp,
+        session: Option<&SessionId>,
+        id: LeaseId,
+    ) -> Result<(), PoolError> {
+        self.give_back(now, session, id, EndReason::GivenUp)
+    }
+
+    fn give_back(
+        &mut self,
+        now: Timestamp,
+        session: Option<&SessionId>,
+        id: LeaseId,
+        reason: EndReason,
+    ) -> Result<(), PoolError> {
         self.begin(now);
         let record = self.leases.get(&id).ok_or(PoolError::UnknownLease { lease: id })?;
         if let Some(caller) = session {
             check_owner(|| id.to_string(), &record.session, caller)?;
         }
-        let reason = if session.is_some() { EndReason::Asked } else { EndReason::Revoked };
+        let reason = if session.is_some() { reason } else { EndReason::Revoked };
         self.commit(Effect::LeaseEnded { lease: id, reason });
         self.schedule();
         Ok(())

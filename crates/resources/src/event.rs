@@ -131,7 +131,7 @@ impl Change {
 /// Why a lease or a resource ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum EndReason {
-    /// The holder released the lease, or the owner deleted the resource.
+    /// The holder released the lease and knows that nothing moves for it any more, or the owner deleted the resource.
     Asked,
     /// The keep-alives of its session stopped.
     SessionExpired,
@@ -149,10 +149,12 @@ pub enum EndReason {
     Displaced,
     /// A resource that the lease held is gone. Grants are all or nothing, so no lease lives on with the rest.
     ResourceGone,
+    /// The holder released the lease and does not know whether something still moves for it.
+    GivenUp,
 }
 
 impl EndReason {
-    /// Whether the holder itself ended the lease, or never had it: nothing needs to move for it any more.
+    /// Whether the holder itself ended the lease and knows that nothing moves for it any more, or never had it.
     pub(crate) fn is_the_holders(self) -> bool {
         matches!(self, EndReason::Asked | EndReason::Undelivered)
     }
@@ -170,6 +172,7 @@ impl fmt::Display for EndReason {
             EndReason::Revoked => "revoked",
             EndReason::Displaced => "displaced by a provider's resource of its id",
             EndReason::ResourceGone => "a resource of it is gone",
+            EndReason::GivenUp => "given back while something may still move",
         })
     }
 }

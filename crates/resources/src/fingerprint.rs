@@ -126,7 +126,7 @@ mod tests {
         let hash = |request: &Request| format!("{:032x}", Fingerprint::of(request).0);
         let mut spec = ResourceSpec::new(ResourceClass::Module, "Arm");
         spec.attributes = [("reach_m".to_owned(), Value::Float(0.82)), ("left".to_owned(), Value::Null)].into();
-        let release = Request::Release { session: None, lease: LeaseId(7) };
+        let release = Request::Release { session: None, lease: LeaseId(7), at_rest: false };
         let consume = Request::Consume { session: session(), requirement: requirement(), resource: None };
         let requests = [
             Request::Create { session: Some(session()), spec },

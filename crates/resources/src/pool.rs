@@ -385,8 +385,9 @@ impl Pool {
                 (Reply::Operated(consumed), ends)
             }
             Request::Acquire(request) => (Reply::Queued(self.enqueue(request, id, print)?), Ends::Nothing),
-            Request::Release { session, lease } => {
-                self.release(now, session.as_ref(), lease)?;
+            Request::Release { session, lease, at_rest } => {
+                let give_back = if at_rest { Pool::release } else { Pool::release_moving };
+                give_back(self, now, session.as_ref(), lease)?;
                 (Reply::Done, Ends::Nothing)
             }
             Request::ConfirmStandstill { session, lease, resource } => {

@@ -20,7 +20,7 @@ use std::time::Duration;
 
 /// The version that [`encode`] writes as the first byte. Every new variant is added at the end and increases the number, so that an older program
 /// refuses records that it does not know; records since [`OLDEST_FORMAT`] are read unchanged.
-pub const FORMAT: u8 = 12;
+pub const FORMAT: u8 = 13;
 /// The oldest version that [`decode`] reads: it has no `Effect::SessionOpened`, and versions before this one have no `Effect::UnitsFreed`.
 pub const OLDEST_FORMAT: u8 = 2;
 /// The newest version whose fingerprints hash the bytes of requests; later versions cannot compare them.

@@ -42,12 +42,15 @@ pub enum Request {
     },
     /// See [`crate::Pool::acquire`].
     Acquire(AcquireRequest),
-    /// See [`crate::Pool::release`].
+    /// See [`crate::Pool::release`] and [`crate::Pool::release_moving`].
     Release {
         /// The session that asks; `None` may release anything.
         session: Option<SessionId>,
         /// The lease.
         lease: LeaseId,
+        /// The holder knows that nothing moves any more for the lease. False for holders of earlier versions, which do not say it.
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        at_rest: bool,
     },
     /// See [`crate::Pool::end_task`].
     EndTask {

@@ -44,6 +44,7 @@ enum Step {
         patience: Option<u64>,
     },
     Release(usize),
+    GiveUp(usize),
     Revoke(usize),
     ConfirmStandstill(usize),
     Cancel(usize),
@@ -69,6 +70,7 @@ fn step() -> impl Strategy<Value = Step> {
         1 => (0..KINDS.len()).prop_map(Step::DeleteUnit),
         8 => acquire,
         5 => (0..16usize).prop_map(Step::Release),
+        1 => (0..16usize).prop_map(Step::GiveUp),
         1 => (0..16usize).prop_map(Step::Revoke),
         1 => (0..16usize).prop_map(Step::ConfirmStandstill),
         1 => (0..16usize).prop_map(Step::Cancel),
@@ -326,6 +328,12 @@ proptest! {
                     if let Some((lease, (session, _))) = model.leases.iter().nth(index).map(|(id, lease)| (*id, *lease)) {
                         pool.release(at, Some(&names[session]), lease).unwrap();
                         model.leases.remove(&lease);
+                    }
+                }
+                Step::GiveUp(index) => {
+                    if let Some((lease, (session, _))) = model.leases.iter().nth(index).map(|(id, lease)| (*id, *lease)) {
+                        pool.release_moving(at, Some(&names[session]), lease).unwrap();
+                        model.revoke(lease, now);
                     }
                 }
                 Step::Revoke(index) => {

@@ -611,8 +611,8 @@ fn a_request_id_used_again_is_performed_once() {
     assert!(grants(&bench.notices()).is_empty());
     let reused = bench.pool.handle(bench.now, "q1", create);
     assert_eq!(reused, Err(PoolError::RequestIdReused { id: "q1".into() }));
-    bench.pool.handle(bench.now, "r1", Request::Release { session: None, lease: granted.id }).unwrap();
-    bench.pool.handle(bench.now, "r1", Request::Release { session: None, lease: granted.id }).unwrap();
+    bench.pool.handle(bench.now, "r1", Request::Release { session: None, lease: granted.id, at_rest: true }).unwrap();
+    bench.pool.handle(bench.now, "r1", Request::Release { session: None, lease: granted.id, at_rest: true }).unwrap();
     assert_eq!(bench.pool.handle(bench.now, "q1", acquire), Err(PoolError::UnknownLease { lease: granted.id }));
 }
 

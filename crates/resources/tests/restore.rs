@@ -112,7 +112,7 @@ fn perform(pool: &mut Pool, now: u64, step: &Step, id: u8) -> String {
         }
         Step::Release(index) => {
             let lease = pool.leases().get(*index).map_or(LeaseId(0), |lease| lease.id);
-            Request::Release { session: None, lease }
+            Request::Release { session: None, lease, at_rest: true }
         }
         Step::Confirm(index) => {
             let ending = pool.list().into_iter().flat_map(|view| {
@@ -423,7 +423,8 @@ fn answers_that_an_earlier_version_remembers_for_nobody_knows_whom_are_given_to_
     // A record of before: `r1` was done, whatever it asked, and none was forgotten for it.
     let records = decode(&[5, 1, 9, 2, b'r', b'1', 0, 3, 0]).unwrap();
     let mut pool = Pool::restore(Limits::default(), now, None, records).unwrap();
-    let again = pool.handle_as(now, &speaker("b"), "r1", Request::Release { session: None, lease: LeaseId(7) });
+    let again =
+        pool.handle_as(now, &speaker("b"), "r1", Request::Release { session: None, lease: LeaseId(7), at_rest: true });
     assert_eq!(again, Ok(ratn_resources::Reply::Done));
 }
 

@@ -265,3 +265,20 @@ fn standstill_of_what_no_session_provides_is_confirmed_by_the_opener_of_the_lost
         assert_eq!(pool.confirm_standstill(at(101), None, lease, "arm"), Ok(true), "an operator");
     }
 }
+
+#[test]
+fn a_holder_that_does_not_know_that_nothing_moves_gives_back_what_is_free_when_its_provider_has_confirmed() {
+    let mut bench = Bench::new(Limits::default());
+    bench.pool.release_moving(at(10), Some(&session("a")), bench.lease).unwrap();
+    assert!(bench.granted().is_empty());
+    assert!(bench.confirm(20, "cell").unwrap());
+    assert_eq!(bench.granted().len(), 1);
+    // Nobody confirms: the bound decides.
+    let mut bench = Bench::new(Limits::default());
+    let release = Request::Release { session: Some(session("a")), lease: bench.lease, at_rest: false };
+    bench.pool.handle(at(10), "r", release).unwrap();
+    bench.pool.advance(at(1_500));
+    assert!(bench.granted().is_empty());
+    bench.pool.advance(at(1_510));
+    assert_eq!(bench.granted().len(), 1);
+}

@@ -6,7 +6,7 @@
 //! the manager's answer about that was lost.
 //! A provider of hardware that moves ([`Provider::start_at_rest`]) does not offer a resource on which an earlier goal still runs, and
 //! offers nothing before its driver has reported rest. A resource that such a provider offers but does not watch (the middle of a table,
-//! beside the arms) is offered again when its bound for standstill has passed. A provider that does not follow the leases of what moves (a
+//! beside the arms) is offered again when its bound for standstill has passed, also by the next provider of its [`LeaseWatch`]. A provider that does not follow the leases of what moves (a
 //! process manager, for its pooled drivers) offers a resource that the manager has lost again only when the resource's bound for standstill
 //! has passed: its former holders may not have heard yet. An offer whose answer was lost counts as accepted, and so do the offers of an
 //! earlier process in the same session. If the manager had a resource and refuses it now (somebody took a role away), it is offered again,
@@ -14,13 +14,14 @@
 
 mod bounds;
 
+pub(crate) use bounds::Bounds;
+
 use crate::action::STOP_GRACE;
 use crate::client::{CallError, Channels, ResourceClient};
 use crate::endpoint::Endpoint;
 use crate::lease_watch::LeaseWatch;
 use crate::panic::exit_on_panic;
 use crate::session::{Session, SessionState};
-use bounds::Bounds;
 use futures::{StreamExt, stream};
 use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_proto::types::{Resource, ResourceEventKind, ResourceUpdate};
@@ -79,6 +80,7 @@ struct Shared {
 struct Desired {
     /// By resource id.
     states: BTreeMap<String, DesiredState>,
+    /// Of everything that moves in this process.
     bounds: Bounds,
 }
 
@@ -140,11 +142,13 @@ impl Provider {
         leases: Option<LeaseWatch>,
     ) -> Result<Provider, CallError> {
         let client = ResourceClient::new(channels, endpoint, session.id())?;
+        let bounds = leases.as_ref().map(LeaseWatch::bounds).unwrap_or_default();
+        bounds.all_lost();
         let shared = Arc::new(Shared {
             client,
             session: session.id().to_owned(),
             state: session.state(),
-            desired: Mutex::default(),
+            desired: Mutex::new(Desired { states: BTreeMap::new(), bounds }),
             missing: Notify::new(),
             leases,
             generation: AtomicU64::new(1),
@@ -197,7 +201,7 @@ impl Provider {
     /// Registers resources that an earlier session or process offered: what they were leased for may still move. Each is offered when its
     /// bound for standstill has passed from now on.
     pub async fn may_move(&self, resources: &[Resource]) {
-        let mut desired = self.shared.desired.lock().await;
+        let desired = self.shared.desired.lock().await;
         for resource in resources {
             desired.bounds.lost(&resource.id, resource.standstill());
         }
@@ -315,7 +319,7 @@ impl Shared {
         let mut asked = Vec::with_capacity(ids.len());
         for id in ids {
             let Some(entry) = desired.states.get_mut(id) else { continue };
-            before.insert(id.clone(), entry.asked());
+            before.insert(id.clone(), entry.asked(id, &desired.bounds));
             asked.push(ask(self.client.clone(), id.clone(), entry.resource.clone()));
         }
         let answers: Vec<_> = stream::iter(asked).buffer_unordered(AT_ONCE).collect().await;
@@ -327,7 +331,7 @@ impl Shared {
         }
         for (id, answer) in answers {
             let Some(entry) = desired.states.get_mut(&id) else { continue };
-            entry.learn(&id, before.get(&id).copied().unwrap_or_default(), &answer, &mut desired.bounds);
+            entry.learn(&id, before.get(&id).copied().unwrap_or_default(), &answer, &desired.bounds);
             let done = entry.conclude(&id, answer);
             match &done {
                 Ok(false) => self.missing.notify_one(),
@@ -393,7 +397,7 @@ impl Desired {
 
 impl DesiredState {
     /// The manager does not have the resource any more; its former holder may move it until its bound has passed.
-    fn gone(&mut self, id: &str, bounds: &mut Bounds) {
+    fn gone(&mut self, id: &str, bounds: &Bounds) {
         self.confirmed = false;
         if std::mem::take(&mut self.presence) != Presence::Absent {
             bounds.lost(id, self.standstill);
@@ -401,19 +405,20 @@ impl DesiredState {
     }
 
     /// Records that the manager is being asked; returns the presence before that.
-    fn asked(&mut self) -> Presence {
+    fn asked(&mut self, id: &str, bounds: &Bounds) -> Presence {
         let before = self.presence;
         if let Some(resource) = &self.resource {
             self.standstill = self.standstill.max(resource.standstill());
             if before == Presence::Absent {
                 self.presence = Presence::Unknown;
             }
+            self.note(id, bounds);
         }
         before
     }
 
     /// Updates the presence by the manager's answer.
-    fn learn(&mut self, id: &str, before: Presence, answer: &Result<(), CallError>, bounds: &mut Bounds) {
+    fn learn(&mut self, id: &str, before: Presence, answer: &Result<(), CallError>, bounds: &Bounds) {
         match answer {
             Ok(()) if self.resource.is_some() => self.presence = Presence::There,
             // Withdrawn: its holder has lost it, and may not have heard yet.
@@ -429,6 +434,15 @@ impl DesiredState {
                 }
                 Some(_) => self.presence = before,
             },
+        }
+        self.note(id, bounds);
+    }
+
+    /// Notes whether the manager may have the resource, for the provider after this one.
+    fn note(&self, id: &str, bounds: &Bounds) {
+        match self.presence {
+            Presence::Absent => bounds.not_offered(id),
+            Presence::Unknown | Presence::There => bounds.offered(id, self.standstill),
         }
     }
 

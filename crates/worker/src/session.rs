@@ -38,8 +38,6 @@ const PINGS_PER_TTL: u32 = 4;
 const BACKOFF: (Duration, Duration) = (Duration::from_millis(20), Duration::from_millis(500));
 /// The reason code of a refusal because the session belongs to another caller.
 const NOT_YOURS: &str = "NOT_YOURS";
-/// Delay after an answer until the rest of the answer's content is known, too.
-const MOMENT: Duration = Duration::from_millis(5);
 /// Time limit for the last ping, which ends the session.
 const FAREWELL: Duration = Duration::from_millis(200);
 
@@ -114,8 +112,17 @@ enum Predecessor {
 /// machine was suspended. A handle: clones share everything.
 #[derive(Debug, Clone)]
 pub(crate) struct Belief {
-    until: watch::Receiver<BootInstant>,
+    now: watch::Receiver<Believed>,
     clock: BootClock,
+}
+
+/// What an answer says: one value, so that nobody sees the renewed time without the loss that came with it.
+#[derive(Debug, Clone, Copy)]
+struct Believed {
+    /// The session lives until then.
+    until: BootInstant,
+    /// As [`SessionState::generation`].
+    generation: u64,
 }
 
 /// The session was not alive within the deadline.
@@ -190,8 +197,8 @@ impl Session {
     ) -> Session {
         let end = CancellationToken::new();
         let (tell, state) = watch::channel(SessionState::default());
-        let (expires, until) = watch::channel(clock.now());
-        let belief = Belief { until, clock: clock.clone() };
+        let (believes, now) = watch::channel(Believed { until: clock.now(), generation: 0 });
+        let belief = Belief { now, clock: clock.clone() };
         let keeper = SessionTask {
             clock,
             number: None,
@@ -202,7 +209,7 @@ impl Session {
             standing,
             predecessor,
             ttl,
-            expires,
+            believes,
             tell,
             end: end.clone(),
         };
@@ -318,17 +325,18 @@ impl Trust {
     /// Whether everything that the session owned and held is still its own. While that is unknown (the manager is not heard, or this
     /// process was suspended), it waits. What counts as gone is defined at [`Session::gone`].
     pub async fn is_kept(&mut self) -> bool {
-        while !self.belief.holds() {
+        loop {
+            let Believed { until, generation } = *self.belief.now.borrow_and_update();
+            if self.belief.clock.now() < until {
+                return generation <= 1;
+            }
             tokio::select! {
-                // The session's state follows a moment after the answer.
-                changed = self.belief.until.changed() => match changed {
-                    Ok(()) => tokio::time::sleep(MOMENT).await,
-                    Err(_) => return false,
+                changed = self.belief.now.changed() => if changed.is_err() {
+                    return false;
                 },
                 () = gone(self.state.clone(), self.ttl) => return false,
             }
         }
-        self.state.borrow().generation <= 1
     }
 
     /// Returns when everything is gone for good, as [`Session::gone`] does.
@@ -363,16 +371,16 @@ impl Belief {
     /// Whether the session is believed to live now. For code that cannot rely on a timer, which stands still while the machine is
     /// suspended.
     pub(crate) fn holds(&self) -> bool {
-        self.clock.now() < *self.until.borrow()
+        self.clock.now() < self.now.borrow().until
     }
 
     /// Returns `margin` before the belief ends, unless it is renewed before.
     async fn nearly_ended(mut self, margin: Duration) {
         loop {
-            let at = self.until.borrow_and_update().saturating_sub(margin);
+            let at = self.now.borrow_and_update().until.saturating_sub(margin);
             tokio::select! {
                 biased;
-                changed = self.until.changed() => if changed.is_err() { return },
+                changed = self.now.changed() => if changed.is_err() { return },
                 () = self.clock.sleep_until(at) => return,
             }
         }
@@ -395,7 +403,7 @@ struct SessionTask {
     predecessor: Predecessor,
     ttl: Duration,
     clock: BootClock,
-    expires: watch::Sender<BootInstant>,
+    believes: watch::Sender<Believed>,
     tell: watch::Sender<SessionState>,
     end: CancellationToken,
     /// The session's number at the manager, from its last answer.
@@ -408,7 +416,7 @@ impl SessionTask {
         loop {
             let before = self.tell.borrow().generation;
             let (end, mut state) = (self.end.clone(), self.tell.subscribe());
-            let belief = Belief { until: self.expires.subscribe(), clock: self.clock.clone() };
+            let belief = Belief { now: self.believes.subscribe(), clock: self.clock.clone() };
             let ran_out = async {
                 // Counts only once the session is alive; the sender is in this task.
                 let _ = state.wait_for(|state| state.alive).await;
@@ -466,19 +474,20 @@ impl SessionTask {
                 Ok(Ok(None)) | Err(_) => return,
             };
             let ttl = Duration::from_millis(answer.ttl_ms);
-            // Counted from the question, so that the session never lives longer here than at the manager.
-            self.expires.send_replace(asked + ttl);
             // A manager that does not number its sessions answers 0. An answer that is read long after its question, as after a suspension
             // of the machine, no longer keeps the session alive.
             let holds = self.clock.now() < asked + ttl;
             let is_another = self.number.replace(answer.number).is_some_and(|before| before != answer.number);
+            let before = *self.tell.borrow();
+            let generation = before.generation + u64::from(answer.created || is_another || before.generation == 0);
+            // Counted from the question, so that the session never lives longer here than at the manager.
+            self.believes.send_replace(Believed { until: asked + ttl, generation });
             self.tell.send_if_modified(|state| {
-                let before = *state;
                 // The answer that said `created` may have been lost with its stream.
                 let is_first = before.generation == 0 && !answer.created;
                 state.found |= is_first && self.predecessor == Predecessor::Unknown;
                 state.number = answer.number;
-                state.generation += u64::from(answer.created || is_another || before.generation == 0);
+                state.generation = generation;
                 state.alive |= holds;
                 state.taken = false;
                 if holds {
@@ -535,7 +544,22 @@ impl SessionTask {
 
     /// Time limit for an answer: until the session expires; after that, the time to live.
     fn patience(&self) -> Duration {
-        let left = self.expires.borrow().saturating_duration_since(self.clock.now());
+        let left = self.believes.borrow().until.saturating_duration_since(self.clock.now());
         if left.is_zero() { self.ttl } else { left }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn who_asks_between_the_two_reports_of_an_answer_is_not_told_that_what_is_lost_is_kept() {
+        let (ttl, clock) = (Duration::from_secs(60), BootClock::default());
+        // The manager has made the session again; of that only the renewed belief has been reported.
+        let (_tell, state) = watch::channel(SessionState { alive: true, generation: 1, ..SessionState::default() });
+        let (_believes, now) = watch::channel(Believed { until: clock.now() + ttl, generation: 2 });
+        let mut trust = Trust { state, belief: Belief { now, clock }, ttl };
+        assert!(!trust.is_kept().await);
     }
 }

@@ -39,6 +39,7 @@ pub(crate) fn release(session: &str, lease: u64) -> v1::ResourceServiceReleaseRe
         session_id: session.to_owned(),
         lease_id: lease,
         note: String::new(),
+        at_rest: true,
     }
 }
 

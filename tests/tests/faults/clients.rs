@@ -294,6 +294,7 @@ impl Client {
                 session_id: session(self.number),
                 lease_id: lease.id,
                 note: String::new(),
+                at_rest: true,
             };
             async move { once(patience, rpc.release(question)).await }
         })

@@ -93,6 +93,7 @@ impl From<GoalOutcome> for v1::GoalResult {
             measured,
             reason: outcome.reason,
             orphaned: false,
+            may_move: false,
         }
     }
 }

@@ -715,6 +715,11 @@ pub struct ResourceServiceReleaseRequest {
     /// Note for the next holder of its resources, at most 256 bytes: task control tells with it what it has changed in the world until now.
     #[prost(string, tag = "4")]
     pub note: ::prost::alloc::string::String,
+    /// The holder knows that nothing moves any more for the lease: all goals that it gave under it have ended, and it has heard how. Then all of it is free
+    /// at once. If not, units of resources that move (`standstill_ms`) are free when their providers have confirmed standstill, or their bounds have passed;
+    /// so are those of clients that do not say it.
+    #[prost(bool, tag = "5")]
+    pub at_rest: bool,
 }
 /// The lease has ended.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1776,7 +1781,7 @@ pub mod resource_service_client {
                 .insert(GrpcMethod::new("ratn.v1.ResourceService", "Withdraw"));
             self.inner.unary(req, path, codec).await
         }
-        /// Gives a lease back.
+        /// Gives a lease back. Unless the holder knows that nothing moves any more for it, the lease ends as a revoked one does.
         pub async fn release(
             &mut self,
             request: impl tonic::IntoRequest<super::ResourceServiceReleaseRequest>,
@@ -2185,7 +2190,7 @@ pub mod resource_service_server {
             tonic::Response<super::WithdrawResponse>,
             tonic::Status,
         >;
-        /// Gives a lease back.
+        /// Gives a lease back. Unless the holder knows that nothing moves any more for it, the lease ends as a revoked one does.
         async fn release(
             &self,
             request: tonic::Request<super::ResourceServiceReleaseRequest>,
@@ -6171,6 +6176,10 @@ pub struct GoalResult {
     /// The provider ended the goal because it had no listener, or because its lease had ended: the outcome is not the action's own.
     #[prost(bool, tag = "5")]
     pub orphaned: bool,
+    /// Something may still move for the goal: its action was told to stop and has not returned, or it is not known whether a goal that it gave to another
+    /// provider has ended. Providers of earlier versions do not say it.
+    #[prost(bool, tag = "6")]
+    pub may_move: bool,
 }
 /// A request on a client's stream.
 #[derive(Clone, PartialEq, ::prost::Message)]

@@ -1,6 +1,7 @@
 //! The course of an acquire: from the request to the resource manager to the event of its answer, or of the lease that another node of the run has
 //! handed over meanwhile.
 
+use super::goals::Doubtful;
 use super::waiting::{LONG_BESIDE_OTHERS, OVERDUE};
 use super::{Answer, Whom, Withdrawal};
 use crate::decided::{REFUSED_PATIENCE, Unanswered, insist};
@@ -50,6 +51,8 @@ pub(super) struct Acquiring {
     pub(super) resources: ResourceClient,
     pub(super) trust: Trust,
     pub(super) told: Told,
+    /// A lease that is handed over may have been that of a goal that was lost.
+    pub(super) doubtful: Doubtful,
     pub(super) whom: Whom,
     /// Cancels [`super::waiting::Asking::over`] when its last clone is dropped.
     pub(super) over: Arc<DropGuard>,
@@ -133,7 +136,8 @@ impl Acquiring {
     }
 
     async fn give_back(&self, lease: LeaseId) {
-        let release = || self.resources.release(lease);
+        let at_rest = self.doubtful.goes_back_at_rest(lease);
+        let release = || self.resources.release_with_note(lease, String::new(), at_rest);
         if let Err(undone) = insist(&self.trust, Unanswered::Waits, release).await {
             tracing::warn!(instance = %self.instance, "a lease that is not used was not given back: {undone}");
         }

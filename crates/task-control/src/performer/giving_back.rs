@@ -1,5 +1,5 @@
 //! Releases what an instance held: its lease, with a note about what the run has committed, and its projection. Each is released when nothing uses it
-//! any more and earlier decisions are on disk. Only operations wait for a release.
+//! any more and earlier decisions are on disk. A lease for which something may still move is given back as such. Only operations wait for a release.
 
 use super::Performer;
 use crate::decided::{Unanswered, insist};
@@ -52,6 +52,7 @@ impl Performer {
             self.holds.set(self.leases.has_speculative());
         }
         let (resources, world, trust) = (self.resources.clone(), self.world.clone(), self.trust.clone());
+        let doubtful = self.goals.doubtful.clone();
         idle.extend(lease.into_iter().flat_map(|lease| self.goals.under(lease)));
         let returns = lease.map(|_| self.order.returning.begin());
         let note = self.told.left(self.decided).to_string();
@@ -73,7 +74,8 @@ impl Performer {
                 end_projection(&world, &trust, instance, projection).await;
             }
             if let Some(lease) = lease {
-                let release = || resources.release_with_note(lease, note.clone());
+                let at_rest = doubtful.goes_back_at_rest(lease);
+                let release = || resources.release_with_note(lease, note.clone(), at_rest);
                 // An absent resource manager keeps the lease until it is told: wait for it as long as the session may live.
                 if let Err(undone) = insist(&trust, Unanswered::Waits, release).await {
                     tracing::warn!(%instance, "a lease was not given back: {undone}");

@@ -1,6 +1,7 @@
 //! The life of one goal, from giving it to a provider (or finding it there again) to the event of its end.
 
 use super::Answer;
+use super::goals::Doubtful;
 use super::told::Told;
 use crate::ledger::Confirmed;
 use crate::readable::{one_line, readable};
@@ -13,21 +14,22 @@ use ratn_model::measurement::Measurement;
 use ratn_model::program::{ABORTED, PREEMPTED};
 use ratn_model::value::Value;
 use ratn_proto::types::{Goal, GoalImproved, GoalOutcome, HOST_KIND};
+use ratn_worker::action::STOP_GRACE;
 use ratn_worker::client::retry_unanswered;
-use ratn_worker::client::{ActionClient, CallError, Channels, ProcessClient, ResourceClient, Said};
+use ratn_worker::client::{ActionClient, CallError, Channels, Fate, ProcessClient, ResourceClient, Said};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::DEFAULT_TTL;
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
-/// A cancelled goal whose provider does not end it within this time is abandoned.
-const CANCEL_DEADLINE: Duration = Duration::from_secs(2);
-/// Interval between cancels while the provider does not know the goal yet.
-const TELL_AGAIN: Duration = Duration::from_millis(50);
+/// A cancelled goal whose provider does not end it within this time is abandoned: what it moves may still move. A provider says after its grace that a
+/// goal has not ended.
+const CANCEL_DEADLINE: Duration = STOP_GRACE.saturating_add(Duration::from_millis(500));
 /// How long a goal goes on without task control, so that a resumed run finds it under way: as long as its lease would live.
 pub(super) const GRACE_MS: u64 = DEFAULT_TTL.as_millis() as u64;
 /// How long the resource of a provider that has ended may still exist: its process manager withdraws it at once, and if that has ended too, the
@@ -117,6 +119,9 @@ pub(super) struct Performing {
     /// The run is over: no goal begins any more.
     pub(super) over: CancellationToken,
     pub(super) told: Told,
+    /// The goal was given, and it is not known that nothing moves for it any more.
+    pub(super) may_move: AtomicBool,
+    pub(super) doubtful: Doubtful,
 }
 
 /// The deadline sent to the provider, in milliseconds of wall time; 0 for none.
@@ -138,16 +143,8 @@ impl Performing {
                 is_safe = safe.safe() => if !is_safe { return },
             }
         }
-        for before in &self.before {
-            tokio::select! {
-                biased;
-                () = self.stop.cancelled() => return,
-                () = self.over.cancelled() => return,
-                () = before.cancelled() => {}
-            }
-        }
         // A goal that was given before is looked for first.
-        if given == Given::Now && !self.sees_what_was_decided().await {
+        if given == Given::Now && !(self.is_its_turn().await && self.sees_what_was_decided().await) {
             return;
         }
         if given != Given::ToStop && self.stop.is_cancelled() || self.over.is_cancelled() {
@@ -157,11 +154,28 @@ impl Performing {
             Ok(endpoint) => self.execute(endpoint, given).await,
             Err(reason) => Some(self.aborted(reason.clone())),
         };
+        // Whoever gives the lease back says so.
+        if self.may_move.load(Ordering::Acquire) {
+            self.doubtful.add(self.goal.lease.as_ref().map(|lease| lease.id));
+        }
         if let Some(event) = event
             && !self.stop.is_cancelled()
         {
             let _ = self.events.send(event.into()).await;
         }
+    }
+
+    /// Waits for the end of the goals that have to end first; returns whether the goal may be given.
+    async fn is_its_turn(&self) -> bool {
+        for before in &self.before {
+            tokio::select! {
+                biased;
+                () = self.stop.cancelled() => return false,
+                () = self.over.cancelled() => return false,
+                () = before.cancelled() => {}
+            }
+        }
+        true
     }
 
     /// Waits until the root has every earlier decision; returns whether the goal may be given.
@@ -180,6 +194,7 @@ impl Performing {
     /// `None` if the goal was cancelled.
     async fn execute(&self, endpoint: &Endpoint, given: Given) -> Option<Event> {
         let begun = Instant::now();
+        self.may_move.store(true, Ordering::Release);
         let ending = async {
             let mut ending = std::pin::pin!(self.ending(endpoint, given));
             tokio::select! {
@@ -198,7 +213,7 @@ impl Performing {
                 let stopping = async {
                     tokio::select! {
                         _ = &mut ending => {}
-                        () = Box::pin(self.tell_to_stop(endpoint)) => drop(ending.await),
+                        () = Box::pin(self.actions.stop(endpoint, &self.goal.id)) => drop(ending.await),
                     }
                 };
                 let _ = tokio::time::timeout(CANCEL_DEADLINE, stopping).await;
@@ -208,15 +223,9 @@ impl Performing {
         Some(self.in_time(event, begun))
     }
 
-    /// Repeats the cancel until it is heard: a goal and its cancel travel on different paths, and a goal whose call is being repeated may arrive
-    /// after the cancel.
-    async fn tell_to_stop(&self, endpoint: &Endpoint) {
-        while match self.actions.cancel(endpoint, &self.goal.id).await {
-            Ok(under_way) => !under_way,
-            Err(error) => error.is_crash(),
-        } {
-            tokio::time::sleep(TELL_AGAIN).await;
-        }
+    /// The end of the goal was heard.
+    fn heard(&self, fate: &Fate) {
+        self.may_move.store(fate.may_move, Ordering::Release);
     }
 
     /// Resolves when the goal only improves a given result while there are other runs: its resources are not held for that.
@@ -239,7 +248,8 @@ impl Performing {
     }
 
     async fn found(&self, endpoint: &Endpoint) -> Event {
-        match self.actions.attach_hearing(endpoint, self.goal.clone(), |said| self.said(said)).await {
+        let fate = self.actions.attach_hearing(endpoint, self.goal.clone(), |said| self.said(said)).await;
+        match fate.inspect(|fate| self.heard(fate)) {
             Ok(fate) if fate.orphaned => {
                 self.unknown(format!("it was stopped while task control was gone: {}", fate.outcome.reason))
             }
@@ -249,6 +259,7 @@ impl Performing {
             Err(error)
                 if error.code() == Some(tonic::Code::NotFound)
                     && self.would_be_known(endpoint).await
+                    && self.is_its_turn().await
                     && self.sees_what_was_decided().await
                     && !self.stop.is_cancelled() =>
             {
@@ -259,7 +270,7 @@ impl Performing {
             }
             // It may be under way: whoever implements no `Attach` keeps none of its goals.
             Err(error) if error.code() == Some(tonic::Code::Unimplemented) => {
-                let _ = tokio::time::timeout(CANCEL_DEADLINE, self.tell_to_stop(endpoint)).await;
+                let _ = tokio::time::timeout(CANCEL_DEADLINE, self.actions.stop(endpoint, &self.goal.id)).await;
                 self.unknown("its worker does not know which goals it was given before (it has no `Attach`)".to_owned())
             }
             Err(error) => self.lost(endpoint, &error).await,
@@ -268,8 +279,13 @@ impl Performing {
 
     async fn given(&self, endpoint: &Endpoint) -> Event {
         let is_wanted = || !self.stop.is_cancelled();
-        match self.actions.execute_hearing(endpoint, self.goal.clone(), is_wanted, |said| self.said(said)).await {
-            Ok(outcome) => self.finished(outcome),
+        let fate = self.actions.execute_hearing(endpoint, self.goal.clone(), is_wanted, |said| self.said(said)).await;
+        // A provider that refuses a goal has not begun it.
+        if fate.as_ref().is_err_and(|error| !error.is_crash() && !error.is_unreadable()) {
+            self.may_move.store(false, Ordering::Release);
+        }
+        match fate.inspect(|fate| self.heard(fate)) {
+            Ok(fate) => self.finished(fate.outcome),
             // A malformed goal will be malformed the next time, too.
             Err(error) if error.code() == Some(tonic::Code::InvalidArgument) => self.aborted(said(&error)),
             // An unreadable answer will be unreadable the next time, too.
@@ -315,7 +331,7 @@ impl Performing {
     async fn unreadable(&self, endpoint: &Endpoint, unreadable: &CallError) -> Event {
         if !matches!(unreadable, CallError::Malformed { .. }) {
             let attached = self.actions.attach_hearing(endpoint, self.goal.clone(), |said| self.said(said));
-            match Box::pin(attached).await {
+            match Box::pin(attached).await.inspect(|fate| self.heard(fate)) {
                 Ok(fate) if !fate.orphaned => return self.finished(fate.outcome),
                 Err(broken @ CallError::Broken { .. }) if !broken.is_unreadable() => {
                     return self.lost(endpoint, &broken).await;
@@ -328,12 +344,13 @@ impl Performing {
             }
         }
         // The goal may be under way still, and the next holder gets the same resource.
-        let _ = tokio::time::timeout(CANCEL_DEADLINE, self.tell_to_stop(endpoint)).await;
+        let _ = tokio::time::timeout(CANCEL_DEADLINE, self.actions.stop(endpoint, &self.goal.id)).await;
         self.aborted(format!("its worker answered what cannot be read: {}", said(unreadable)))
     }
 
     async fn attached(&self, endpoint: &Endpoint, broken: &CallError) -> Event {
-        match self.actions.attach_hearing(endpoint, self.goal.clone(), |said| self.said(said)).await {
+        let fate = self.actions.attach_hearing(endpoint, self.goal.clone(), |said| self.said(said)).await;
+        match fate.inspect(|fate| self.heard(fate)) {
             Ok(fate) if !fate.orphaned => self.finished(fate.outcome),
             Err(error) if error.is_unreadable() => self.unreadable(endpoint, &error).await,
             _ => self.lost(endpoint, broken).await,

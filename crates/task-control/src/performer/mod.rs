@@ -46,7 +46,7 @@ use ratn_executive::protocol::{CERTAIN, Command, Event, Note};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, Revision};
-use ratn_model::program::Program;
+use ratn_model::program::{Nature, Program, State, StateKind};
 use ratn_model::resource::Requirement;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
@@ -57,7 +57,7 @@ use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient
 use ratn_worker::session::{DEFAULT_TTL, Session, SessionState, Standing, Trust};
 use ratn_worker::trace::{self, TraceContext};
 use ratn_world::world::World;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
@@ -87,6 +87,14 @@ fn holder(task: &str, path: &str) -> String {
         length if length <= room => format!("{task}: {path}"),
         length => format!("{task}: …{}", path.chars().skip(length - room).collect::<String>()),
     }
+}
+
+/// The paths of the states of a program whose goals change nothing in the environment.
+fn only_looks(program: &Program) -> BTreeSet<String> {
+    let looks = |state: &&State| {
+        matches!(state.kind, StateKind::Action { .. }) && state.annotations.nature != Nature::Irreversible
+    };
+    program.states.iter().filter(looks).map(|state| state.path.clone()).collect()
 }
 
 /// Whether a session was opened by a resumption that died before it had restored the run's resources in it: then nothing in it is the run's. `before`
@@ -149,6 +157,8 @@ impl From<Event> for Answer {
 pub(super) struct Performer {
     run: String,
     program: Arc<Program>,
+    /// The paths (without visits) of the states whose goals only compute or sense.
+    only_looks: BTreeSet<String>,
     urgency: Urgency,
     standing: Standing,
     /// The robot's seconds per second.
@@ -291,6 +301,7 @@ impl Performer {
         Ok(Performer {
             run,
             program: Arc::clone(program),
+            only_looks: only_looks(program),
             urgency: place.urgency,
             standing,
             speed: place.speed,
@@ -387,7 +398,8 @@ impl Performer {
         let operates = |command: &Command| matches!(command, Command::Operate { .. });
         let is_free = !self.told.has_others() && self.order.operating.is_empty() && !commands.iter().any(operates);
         let handover = is_free.then(|| self.leases.handover(event, commands, &self.asking, Instant::now()));
-        self.handover = handover.flatten();
+        // A lease for which something may still move goes back as such.
+        self.handover = handover.flatten().filter(|one| !self.goals.doubtful.has(one.lease.id));
         // Nothing is handed to an instance whose answer is under way: the lease goes back.
         self.handover.take_if(|one| one.waits && self.asking.hand(one.to, &one.lease) != Some(Ok(())));
     }
@@ -543,6 +555,7 @@ impl Performer {
             trust: self.trust.clone(),
             over: course.over,
             told: self.told.clone(),
+            doubtful: self.goals.doubtful.clone(),
             whom: Whom { resources: self.resources.clone(), world: self.world.clone(), told: self.told.clone() },
         };
         let mut asking = Box::pin(trace::within(self.of(instance), acquiring.ask(self.events.clone())));

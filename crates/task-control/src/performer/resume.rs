@@ -412,9 +412,11 @@ impl Performer {
         over
     }
 
-    /// Gives back the leases that the session holds and the run does not: those that it was about to give back, with a note about its commits; and,
+    /// Gives back the leases that the session holds and the run does not, as such for which something may still move: those that it was about to give back, with a note about its commits; and,
     /// after the withdrawals (which also return what was used up), grants that nobody heard of. Notes of earlier holders stay at the resources.
     async fn sweep(&mut self, ledger: &Ledger, withdrawn: CancellationToken) -> anyhow::Result<()> {
+        // How all goals under them have ended that were given before is not known.
+        self.goals.doubtful.add(ledger.held.iter().copied());
         let living = living_leases(&self.resources, &self.run).await?;
         let (known, unheard): (Vec<LeaseId>, BTreeSet<LeaseId>) = {
             let is_known = |lease: &&LeaseId| ledger.returned.contains(lease);
@@ -481,7 +483,8 @@ async fn living_leases(resources: &ResourceClient, run: &str) -> anyhow::Result<
 }
 
 async fn release(resources: &ResourceClient, trust: &Trust, lease: LeaseId, note: &str) {
-    let release = || resources.release_with_note(lease, note.to_owned());
+    // What was begun under it before is not known.
+    let release = || resources.release_with_note(lease, note.to_owned(), false);
     if let Err(undone) = insist(trust, Unanswered::Waits, release).await {
         tracing::warn!("a lease that was left from before was not given back: {undone}");
     }

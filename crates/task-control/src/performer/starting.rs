@@ -4,6 +4,7 @@ use super::Performer;
 use super::goal::{self, Given, Performing};
 use super::goals::Job;
 use crate::safe_on_disk::Mark;
+use ratn_event_log::without_visits;
 use ratn_executive::protocol::Goal;
 use ratn_model::id::InstanceId;
 use ratn_model::resource::LeasedResource;
@@ -12,6 +13,7 @@ use ratn_proto::types;
 use ratn_worker::trace;
 use std::collections::BTreeMap;
 use std::sync::Mutex;
+use std::sync::atomic::AtomicBool;
 use tokio_util::sync::CancellationToken;
 
 impl Performer {
@@ -28,7 +30,8 @@ impl Performer {
             Err(reason) => (String::new(), Err(reason)),
         };
         let (resource, over) = (source.clone(), CancellationToken::new());
-        let before = if given == Given::Now { self.goals.before(&source) } else { Vec::new() };
+        let acts = self.acts(instance);
+        let before = self.goals.before(instance, lease, &source, acts);
         // A goal without a projection reads the root, which has to contain every earlier decision; unless the goal reads no facts.
         let looks_at_root = given != Given::ToStop && goal.projection.is_none() && !goal.reads_nothing;
         let sees = looks_at_root.then(|| (self.recorded.subscribe(), self.decided));
@@ -52,6 +55,8 @@ impl Performer {
             sees,
             over: self.over.clone(),
             told: self.told.clone(),
+            may_move: AtomicBool::new(false),
+            doubtful: self.goals.doubtful.clone(),
             goal: types::Goal {
                 id: format!("{}/{instance}/{attempt}", self.run),
                 action: goal.action.to_string(),
@@ -72,11 +77,17 @@ impl Performer {
             drop(ends);
         };
         let ended = tokio::spawn(trace::within(self.of(instance), performing));
-        let job = Job { attempt, lease, resource, stop, ended, over };
+        let job = Job { attempt, lease, resource, acts, stop, ended, over };
         if given == Given::ToStop {
-            return self.goals.stop(&job);
+            return self.goals.stop(instance, &job);
         }
         self.goals.awaits(instance, job);
+    }
+
+    /// Whether the goal of an instance changes the environment; true if its state is unknown.
+    fn acts(&self, instance: InstanceId) -> bool {
+        let path = self.paths.get(&instance).map(|path| without_visits(path));
+        path.is_none_or(|path| !self.only_looks.contains(&path))
     }
 
     /// The inputs of a goal in the types of its action's ports, and the output ports that a result must have.

@@ -13,7 +13,7 @@ use ratn_model::resource::Lease;
 use ratn_model::value::Value;
 use ratn_proto::MAX_PORTS_BYTES;
 use ratn_proto::convert::{ports_bytes, wire_ports};
-use ratn_proto::types::{FactRecord, Goal, GoalOutcome};
+use ratn_proto::types::{FactRecord, Goal};
 use ratn_proto::v1;
 use ratn_world::scene::delta::DeltaError;
 use ratn_world::world::{ChangeError, World};
@@ -313,7 +313,9 @@ impl GoalContext {
         Ok(world)
     }
 
-    /// Calls an action of another provider whose resource this goal's lease holds, under that lease. Returns the outputs of the action.
+    /// Calls an action of another provider whose resource this goal's lease holds, under that lease. Returns the outputs of the action. If this
+    /// goal has to stop, or the future is dropped, the called goal is told to stop, also where it would go on without a listener. This goal is
+    /// over when the called one is.
     ///
     /// # Errors
     /// [`CallFailure`], also if the action does not end with success.
@@ -345,13 +347,10 @@ impl GoalContext {
             grace_ms: 0,
             improves: None,
         };
-        let client = ActionClient::new(self.channels.clone());
-        let performed = client.execute(&endpoint, goal, |_, _| {});
-        let outcome: Result<GoalOutcome, CallError> = tokio::select! {
-            biased;
-            () = self.cancelled.cancelled() => return Err(CallFailure::Cancelled { action: name }),
-            outcome = performed => outcome,
-        };
+        let given_up = || CallFailure::Cancelled { action: name.clone() };
+        self.checkpoint().map_err(|_| given_up())?;
+        let call = self.entry.calls.give(ActionClient::new(self.channels.clone()), endpoint, goal);
+        let outcome = call.ok_or_else(given_up)?.outcome(&self.cancelled).await.ok_or_else(given_up)?;
         let outcome = outcome.map_err(|source| CallFailure::Call { action: name.clone(), source })?;
         if outcome.is_success() {
             Ok(outcome.outputs)

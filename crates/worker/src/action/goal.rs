@@ -1,6 +1,7 @@
 //! One goal as the server keeps it: its listeners, whether it was told to stop, how it ended.
 
 use super::ActionFailure;
+use super::called::Calls;
 use crate::access::Caller;
 use crate::panic::exit_on_panic;
 use ratn_model::id::{FencingToken, LeaseId};
@@ -43,8 +44,14 @@ pub(crate) enum StopCause {
 /// How a goal ended.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Ending {
-    /// With an outcome; true if the goal was orphaned: its client or its lease was gone.
-    Outcome(GoalOutcome, bool),
+    /// With an outcome.
+    Outcome {
+        outcome: GoalOutcome,
+        /// Its client or its lease was gone.
+        orphaned: bool,
+        /// Its action has not returned, or it is not known whether a goal that it gave has ended.
+        may_move: bool,
+    },
     /// Without an outcome, as if the process had been killed: the provider shuts down, which is not the goal's fault.
     Gone,
     /// Without an outcome: the world that it worked on is gone, and why. Another attempt may succeed.
@@ -116,8 +123,10 @@ pub(crate) struct GoalEntry {
     /// The last intermediate result; every listener gets it, also one that comes later.
     pub(crate) improved: watch::Sender<Option<v1::GoalImproved>>,
     pub(crate) result: watch::Sender<Option<Ending>>,
-    /// Fires when the goal's action has returned. If an action does not stop in time, this is after its result was sent.
+    /// Fires when the goal's action has returned, and its calls are over. If an action does not stop in time, this is after its result was sent.
     pub(crate) returned: CancellationToken,
+    /// The goals that it gave to other providers.
+    pub(crate) calls: Calls,
     /// The goal is suspended, because its lease may have ended.
     suspended: watch::Sender<bool>,
     stop_when_abandoned: bool,
@@ -154,6 +163,7 @@ impl GoalEntry {
             improved: watch::Sender::new(None),
             result: watch::channel(None).0,
             returned: CancellationToken::new(),
+            calls: Calls::default(),
             suspended: watch::Sender::new(false),
             stop_when_abandoned,
             grace: Duration::from_millis(goal.grace_ms).min(MAX_GRACE),

@@ -12,6 +12,7 @@
 
 mod admission;
 mod authority;
+mod called;
 mod context;
 mod fence;
 mod goal;

@@ -1,11 +1,11 @@
 //! Runs one goal from its beginning to its end.
 //!
 //! ```text
-//! begun ─ the action returns ─────────────────→ result sent, resource free
-//!    └─ told to stop ─ runs on after the grace ─→ result sent ─ the action returns ─→ resource free
+//! begun ─ the action returns ─ its calls are over ─→ result sent, resource free
+//!    └─ told to stop ─ runs on after the grace ─→ result sent ─ the action returns ─ its calls are over ─→ resource free
 //!                                                      └─ runs on for much longer ─→ the server is stuck
 //! ```
-//! A goal keeps its resource until its action has returned, even if a result was sent earlier.
+//! A goal keeps its resource until its action has returned and the goals that it gave are over, even if a result was sent earlier.
 
 use super::context::bounded as bounded_progress;
 use super::goal::{Ending, GoalEntry, StopCause};
@@ -67,6 +67,12 @@ pub(super) async fn run(
         entry.cancelled.cancelled().await;
         tokio::time::sleep(STOP_GRACE).await;
     };
+    let mut performing = std::pin::pin!(async {
+        let performed = (&mut performing).await;
+        // Its lease goes back with its end.
+        entry.calls.end().await;
+        performed
+    });
     let mut returned = true;
     let result = tokio::select! {
         biased;
@@ -92,12 +98,13 @@ pub(super) async fn run(
         // Remove the goal from the running ones before its end is announced: the next goal must find the resource free.
         server.state().end(&entry, server.limits.results_kept);
     }
+    let may_move = !returned || entry.calls.is_unknown();
     let ending = match entry.cause() {
         Some(StopCause::ShuttingDown) if !outcome.is_success() => Ending::Gone,
-        None if lost => Ending::Lost(outcome.reason),
+        None if lost && !may_move => Ending::Lost(outcome.reason),
         cause => {
             let orphaned = !outcome.is_success() && cause.is_some_and(|cause| cause.is_orphaning());
-            Ending::Outcome(outcome, orphaned)
+            Ending::Outcome { outcome, orphaned, may_move }
         }
     };
     entry.result.send_replace(Some(ending));
@@ -112,7 +119,7 @@ pub(super) async fn run(
             server
                 .stuck
                 .send_replace(Some(format!("goal {goal} of {action} was told to stop {told_s} s ago, and still runs")));
-            let _ = performing.await;
+            let _ = performing.as_mut().await;
         }
         tracing::warn!(%goal, %action, %resource, "the goal that was told to stop has ended after all");
         server.state().end(&entry, server.limits.results_kept);

@@ -302,7 +302,8 @@ impl ActionServer {
                 Admission::Joined(entry) => return Ok(Messages::of(&entry, true)),
                 Admission::Stopped(StopCause::ShuttingDown) => return Err(ending()),
                 Admission::Stopped(cause) => {
-                    entry.result.send_replace(Some(Ending::Outcome(cause.failure().into(), false)));
+                    let outcome = cause.failure().into();
+                    entry.result.send_replace(Some(Ending::Outcome { outcome, orphaned: false, may_move: false }));
                     return Ok(Messages::of(&entry, false));
                 }
                 Admission::New => {

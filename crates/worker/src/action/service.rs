@@ -193,7 +193,9 @@ impl Messages {
             }
             self.over = true;
             return Some(match ending {
-                Ending::Outcome(outcome, orphaned) => Ok(Kind::Result(v1::GoalResult { orphaned, ..outcome.into() })),
+                Ending::Outcome { outcome, orphaned, may_move } => {
+                    Ok(Kind::Result(v1::GoalResult { orphaned, may_move, ..outcome.into() }))
+                }
                 Ending::Gone => Err(Status::unavailable("the provider shuts down")),
                 Ending::Lost(reason) => Err(Status::aborted(reason)),
             });

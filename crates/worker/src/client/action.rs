@@ -18,6 +18,9 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 use tonic::{Code, Status};
 
+/// Interval between cancels while the provider does not know the goal yet.
+const STOP_AGAIN: Duration = Duration::from_millis(50);
+
 /// Gives goals to providers.
 #[derive(Debug, Clone)]
 pub struct ActionClient {
@@ -54,6 +57,8 @@ pub struct Fate {
     pub outcome: GoalOutcome,
     /// The goal was stopped because no client listened or its lease had ended: the outcome says nothing of the action.
     pub orphaned: bool,
+    /// Something may still move for the goal: its action has not returned, or it is not known whether a goal that it gave has ended.
+    pub may_move: bool,
 }
 
 /// An action of a provider.
@@ -101,11 +106,12 @@ impl ActionClient {
         goal: Goal,
         on_progress: impl FnMut(String, BTreeMap<String, Value>),
     ) -> Result<GoalOutcome, CallError> {
-        Box::pin(self.execute_hearing(endpoint, goal, || true, only_progress(on_progress))).await
+        let performed = self.execute_hearing(endpoint, goal, || true, only_progress(on_progress));
+        Box::pin(performed).await.map(|fate| fate.outcome)
     }
 
-    /// As [`ActionClient::execute`], with the intermediate results that a goal gives before its end. When `wanted` returns false, the goal
-    /// is not given again.
+    /// As [`ActionClient::execute`], with the intermediate results that a goal gives before its end, and with all that is said of the end. When
+    /// `wanted` returns false, the goal is not given again.
     ///
     /// # Errors
     /// As [`ActionClient::execute`].
@@ -115,7 +121,7 @@ impl ActionClient {
         goal: Goal,
         wanted: impl Fn() -> bool,
         mut on_said: impl FnMut(Said),
-    ) -> Result<GoalOutcome, CallError> {
+    ) -> Result<Fate, CallError> {
         let question = Question::Execute(v1::ExecuteRequest { goal: Some(goal.into()) });
         let mut tries = 1;
         loop {
@@ -127,7 +133,7 @@ impl ActionClient {
                         return Err(error);
                     }
                 }
-                ended => return ended.map(|fate| fate.outcome),
+                ended => return ended,
             }
             tries += 1;
         }
@@ -205,8 +211,8 @@ impl ActionClient {
         if let Some(nonsense) = nonsense {
             return Err(malformed(nonsense));
         }
-        let orphaned = result.orphaned;
-        Ok(Fate { outcome: result.try_into().map_err(malformed)?, orphaned })
+        let (orphaned, may_move) = (result.orphaned, result.may_move);
+        Ok(Fate { outcome: result.try_into().map_err(malformed)?, orphaned, may_move })
     }
 
     /// Asks over a stream that no other goal shares.
@@ -241,6 +247,17 @@ impl ActionClient {
         let question = v1::CancelRequest { goal_id: goal.to_owned() };
         let answer = self.client(endpoint)?.cancel(question).await;
         Ok(answer.map_err(|status| CallError::from_status(endpoint, &status))?.into_inner().under_way)
+    }
+
+    /// Tells a goal to stop until that is heard: a goal and its cancel travel on different paths, and a goal whose call is being repeated may
+    /// arrive after the cancel. Returns also if the provider refuses.
+    pub async fn stop(&self, endpoint: &Endpoint, goal: &str) {
+        while match self.cancel(endpoint, goal).await {
+            Ok(under_way) => !under_way,
+            Err(error) => error.is_crash(),
+        } {
+            tokio::time::sleep(STOP_AGAIN).await;
+        }
     }
 
     /// The actions of a provider.

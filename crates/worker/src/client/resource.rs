@@ -320,16 +320,18 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn release(&self, lease: LeaseId) -> Result<bool, CallError> {
-        self.release_with_note(lease, String::new()).await
+        self.release_with_note(lease, String::new(), true).await
     }
 
-    /// As [`ResourceClient::release`], with a note of at most 256 bytes for the next holder of the resources.
+    /// As [`ResourceClient::release`], with a note of at most 256 bytes for the next holder of the resources. `at_rest` says that the holder
+    /// knows that nothing moves any more for the lease; if not, it ends as a revoked one does: what moves is granted again when its provider has
+    /// confirmed standstill, or its bound has passed.
     ///
     /// # Errors
     /// [`CallError`].
-    pub async fn release_with_note(&self, lease: LeaseId, note: String) -> Result<bool, CallError> {
+    pub async fn release_with_note(&self, lease: LeaseId, note: String, at_rest: bool) -> Result<bool, CallError> {
         let (request_id, session_id) = self.mutation("");
-        let question = v1::ResourceServiceReleaseRequest { request_id, session_id, lease_id: lease.0, note };
+        let question = v1::ResourceServiceReleaseRequest { request_id, session_id, lease_id: lease.0, note, at_rest };
         match self.ask(Asked::Release(question)).await? {
             Answered::Release(ended) => Ok(ended.released),
             _ => Err(self.another("a release")),

@@ -172,11 +172,14 @@ impl Holdings {
         )
     }
 
-    /// Begins a new watch of resources that the session `owner` provides. Before the first watch, `found` says that the session lived when this
-    /// process opened it.
+    /// Begins a new watch of resources that the session `owner` provides. `found` says that it is the session that lived when this process opened
+    /// it: what was granted in another one is this process's.
     pub fn begin(&mut self, owner: &str, found: bool) {
-        if self.owner.replace(owner.to_owned()).is_none() && found {
-            self.before = Before::FirstSnapshot;
+        let is_first = self.owner.replace(owner.to_owned()).is_none();
+        match found {
+            true if is_first => self.before = Before::FirstSnapshot,
+            true => {}
+            false => self.before = Before::Nothing,
         }
     }
 
@@ -415,6 +418,22 @@ mod tests {
         assert_eq!(ended(|holding| holding.token = FencingToken(71)), [(7, 70)]);
         assert_eq!(ended(|holding| holding.session = "another".to_owned()), [(7, 70)]);
         assert_eq!(ended(|_| {}), []);
+    }
+
+    #[test]
+    fn what_was_granted_before_this_process_is_refuted_only_as_long_as_its_session_lives() {
+        let mut holdings = Holdings::default();
+        holdings.begin("cell", true);
+        holdings.tell(&snapshot(&[arm(&[7])], 9));
+        refuted(&holdings, claim(7), "before the provider's process was started again");
+        // Another watch of the same session.
+        holdings.begin("cell", true);
+        holdings.tell(&snapshot(&[arm(&[7])], 9));
+        refuted(&holdings, claim(7), "before the provider's process was started again");
+        // The manager has lost its state, and its clock was set back: it makes the session again, and grants begin below.
+        holdings.begin("cell", false);
+        holdings.tell(&snapshot(&[arm(&[3])], 3));
+        assert_eq!(holdings.check(&claim(3)), ClaimStatus::Confirmed);
     }
 
     #[test]

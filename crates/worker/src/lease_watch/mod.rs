@@ -25,6 +25,7 @@ pub use location::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use crate::boot_clock::{BootClock, BootInstant};
 use crate::client::{CallError, Channels, ResourceClient, ResourceWatch};
 use crate::endpoint::Endpoint;
+use crate::provider::Bounds;
 use crate::session::{Belief, GIVEN_UP_AFTER, Session, SessionState};
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_panic_point::panic_point;
@@ -91,6 +92,7 @@ struct Shared {
     begins_at_rest: AtomicBool,
     trust: Mutex<Trust>,
     clock: BootClock,
+    bounds: Bounds,
 }
 
 /// For how long the manager's last update is trusted.
@@ -142,6 +144,7 @@ impl LeaseWatch {
             begins_at_rest: AtomicBool::new(false),
             trust: Mutex::new(Trust::UntilTold),
             clock,
+            bounds: Bounds::default(),
         };
         LeaseWatch { shared: Arc::new(shared) }
     }
@@ -149,6 +152,11 @@ impl LeaseWatch {
     /// The ids of the resources.
     pub fn resources(&self) -> &[String] {
         &self.shared.resources
+    }
+
+    /// The bounds for standstill of what the providers of this process have offered.
+    pub(crate) fn bounds(&self) -> Bounds {
+        self.shared.bounds.clone()
     }
 
     /// Whether it watches a resource with this id.

@@ -3,6 +3,8 @@
 use super::manager::Manager;
 use super::{LONG, TTL, arm, channels, place};
 use ratn_model::id::{FencingToken, LeaseId};
+use ratn_model::resource::ResourceClass;
+use ratn_proto::types::Resource;
 use ratn_proto::v1::{EndingUnits, Holding};
 use ratn_worker::action::ActionServer;
 use ratn_worker::boot_clock::BootClock;
@@ -164,4 +166,29 @@ async fn standstill_is_confirmed_when_the_driver_has_said_that_it_is_at_rest_and
     let again = manager.until(|pool| pool.confirmations == 2);
     tokio::time::timeout(LONG / 2, again).await.expect("no second confirmation");
     manager.until(|pool| pool.resources["arm@sim"].ending.is_empty()).await;
+}
+
+#[tokio::test]
+async fn what_moves_beside_the_goals_is_offered_by_the_next_provider_of_the_process_when_its_bound_has_passed() {
+    let channels = channels();
+    let leases = LeaseWatch::of(["arm@sim"]);
+    leases.brought_to_rest();
+    let bound = Duration::from_millis(400);
+    let middle = Resource::new("middle@sim", ResourceClass::System, "Middle").with_standstill(bound);
+    let mut places = Vec::new();
+    // The manager comes back at another address, with nothing of before.
+    for is_next in [false, true] {
+        let (directory, endpoint) = place();
+        let manager = Manager::new();
+        let serving = manager.serve(&endpoint).await;
+        places.push((directory, serving));
+        let session = Session::open(&channels, &endpoint, "cell", LONG);
+        session.alive(LONG).await.unwrap();
+        let begun = std::time::Instant::now();
+        let provider = Provider::start_at_rest(&channels, &endpoint, &session, &leases).unwrap();
+        assert_eq!(provider.offer(middle.clone()).await.unwrap(), !is_next);
+        manager.until(|pool| pool.resources.contains_key("middle@sim")).await;
+        assert!(!is_next || begun.elapsed() >= bound, "{:?}", begun.elapsed());
+        session.close().await;
+    }
 }

@@ -202,7 +202,7 @@ mod tests {
 
     fn release() -> Message {
         let (speaker, request_id) = (Speaker::trusted(), String::new());
-        let request = Request::Release { session: None, lease: LeaseId(1) };
+        let request = Request::Release { session: None, lease: LeaseId(1), at_rest: true };
         Message::Perform { speaker, request_id, request, answer: oneshot::channel().0 }
     }
 

@@ -36,7 +36,8 @@ pub(super) async fn release(
     let lease = LeaseId(request.lease_id);
     // First, because the next holder may get the resources, and read the note, in the same turn.
     let left = notes.left(lease, &request.session_id, &caller.name, &request.note, Instant::now());
-    let performed = requests.perform(caller, request.request_id, Request::Release { session, lease }).await;
+    let release = Request::Release { session, lease, at_rest: request.at_rest };
+    let performed = requests.perform(caller, request.request_id, release).await;
     if performed.is_err() {
         notes.take_back(left);
     }

@@ -1,5 +1,7 @@
 use super::*;
 use futures::Stream;
+use ratn_model::id::FencingToken;
+use ratn_model::resource::Lease;
 use ratn_proto::v1;
 use ratn_proto::v1::action_service_server::{ActionService, ActionServiceServer};
 use ratn_proto::v1::{
@@ -12,7 +14,7 @@ use ratn_worker::tls::ClientTls;
 use std::collections::HashMap;
 use std::pin::Pin;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::AtomicU32;
 use tokio_util::sync::DropGuard;
 use tonic::{Code, Request, Response, Status, Streaming};
 use tonic_types::{ErrorDetails, StatusExt};
@@ -93,6 +95,8 @@ impl Bench {
             sees: None,
             over: CancellationToken::new(),
             told: Told::new("run"),
+            may_move: AtomicBool::new(false),
+            doubtful: Doubtful::default(),
             goal: Goal {
                 id: format!("run/1/{action}"),
                 action: action.to_owned(),
@@ -334,6 +338,36 @@ async fn an_answer_that_means_nothing_ends_its_goal_and_is_no_crash() -> anyhow:
         let Some(Event::Finished { outcome, reason, .. }) = event else { anyhow::bail!("{expected}: {event:?}") };
         assert!(outcome == ABORTED && reason.contains(expected), "{outcome}: {reason}");
         assert!(reason.len() < 40_000 && !reason.contains('\u{1b}'), "{reason}");
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn it_is_known_that_nothing_moves_where_a_goal_was_refused_or_its_end_was_heard() -> anyhow::Result<()> {
+    let bench = Bench::new().await?;
+    let ended = |may_move| Ok(GoalResult { outcome: ABORTED.into(), may_move, ..GoalResult::default() });
+    let answers = [
+        (ended(false), false),
+        (ended(true), true),
+        (Err(Status::invalid_argument("no such action")), false),
+        (Err(Status::failed_precondition("the lease is over")), false),
+        // What cannot be read may be the answer to a goal that is under way.
+        (Ok(GoalResult { outcome: "\u{1b}[2J".into(), ..GoalResult::default() }), true),
+    ];
+    for (number, (answer, may_move)) in answers.into_iter().enumerate() {
+        let bound = bind(&Endpoint::Unix(bench._place.path().join(format!("elsewhere-{number}.sock")))).await?;
+        let mut performing = bench.performing("work", None, 0);
+        performing.endpoint = Ok(bound.endpoint().clone());
+        let lease = LeaseId(7);
+        let (token, resources, consumed) = (FencingToken(7), Vec::new(), Vec::new());
+        performing.goal.lease = Some(Lease { id: lease, token, resources, consumed });
+        let doubtful = performing.doubtful.clone();
+        let said = format!("{answer:?}");
+        let services = Services::new().with(ActionServiceServer::new(Elsewhere(answer)));
+        tokio::spawn(bound.serve(services, CancellationToken::new()));
+        performing.perform(Given::Now).await;
+        assert_eq!(doubtful.has(lease), may_move, "{said}");
+        assert_eq!(doubtful.goes_back_at_rest(lease), !may_move);
     }
     Ok(())
 }

@@ -111,7 +111,7 @@ async fn what_was_left_is_told_to_the_next_holder_when_the_last_one_gave_up_befo
     bench.ask(first)?;
     let (lease, _) = granted_after(&mut bench.performer, &mut bench.answers).await?;
     // Its commit is under way for long.
-    bench.performer.resources.release_with_note(lease, "0 12".to_owned()).await?;
+    bench.performer.resources.release_with_note(lease, "0 12".to_owned(), true).await?;
     second.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })?;
     let holds = async |performer: &Performer| {
         let arms = performer.resources.list(&["Arm"]).await?;

@@ -3,6 +3,179 @@
 use super::*;
 use ratn_model::catalogue::ActionSignature;
 use ratn_model::value::{Type, Value};
+use tokio::sync::Notify;
+
+/// `move` brakes, once it was told to stop, until it may stand.
+struct Braking(Arc<Notify>);
+
+#[tonic::async_trait]
+impl Action for Braking {
+    fn name(&self) -> &str {
+        "move"
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        goal.cancelled.cancelled().await;
+        self.0.notified().await;
+        Err(goal.stopped())
+    }
+}
+
+/// `pick` has another provider do something.
+struct Calling;
+
+#[tonic::async_trait]
+impl Action for Calling {
+    fn name(&self) -> &str {
+        "pick"
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        goal.call("Tool", "follow", BTreeMap::new()).await?;
+        Ok(GoalOutcome::success())
+    }
+}
+
+/// Serves an action at a socket of this name.
+async fn serve(bench: &Bench, name: &str, action: impl Action) -> anyhow::Result<(ActionServer, String)> {
+    let server = ActionServer::builder("").one_at_a_time().action(action).build();
+    let bound = bind(&Endpoint::Unix(bench._place.path().join(name))).await?;
+    let endpoint = bound.endpoint().to_string();
+    tokio::spawn(bound.serve(Services::new().with(server.clone().into_service()), CancellationToken::new()));
+    Ok((server, endpoint))
+}
+
+#[tokio::test]
+async fn a_goal_that_acts_waits_for_every_earlier_one_that_acts_and_was_told_to_stop() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (_arm, endpoint) = serve_arm(&mut bench).await?;
+    let may_stand = Arc::new(Notify::new());
+    let (other, at) = serve(&bench, "other.sock", Braking(Arc::clone(&may_stand))).await?;
+    let [moves, plans, next] = [1, 2, 3].map(InstanceId);
+    bench.performer.only_looks.insert("r/plan".to_owned());
+    bench.performer.paths.insert(plans, "r[2]/plan".to_owned());
+    // Another arm, under another lease.
+    let Command::Start { instance, attempt, mut goal } = start(moves, 1, "move", LeaseId(1), &at) else {
+        bail!("it is a start")
+    };
+    goal.lease.iter_mut().for_each(|lease| lease.resources[0].id = "other".to_owned());
+    bench.performer.perform(Command::Start { instance, attempt, goal })?;
+    while other.running() == 0 {
+        tokio::task::yield_now().await;
+    }
+    // In one step it is told to stop, and what follows begins.
+    bench.performer.perform(Command::Cancel { instance: moves, attempt: 1 })?;
+    bench.performer.perform(start(next, 1, "work", LeaseId(2), &endpoint))?;
+    bench.performer.perform(start(plans, 1, "work", LeaseId(3), &endpoint))?;
+    let event = bench.event().await;
+    assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == plans), "{event:?}");
+    let early = tokio::time::timeout(Duration::from_millis(100), bench.event()).await;
+    assert!(early.is_err(), "it moves beside what still moves: {early:?}");
+    may_stand.notify_one();
+    let event = bench.event().await;
+    assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == next), "{event:?}");
+    assert_eq!(other.running(), 0);
+    bench.performer.closed().await
+}
+
+/// A bench with an arm that needs up to a minute to stand still, leased to an instance; and the client of its provider.
+async fn with_slow_arm(instance: InstanceId) -> anyhow::Result<(Bench, Lease, ResourceClient)> {
+    let mut bench = Bench::new().await?;
+    let channels = Channels::new(&ClientTls::none());
+    let provider = ResourceClient::new(&channels, &bench.endpoints.resource_manager, bench._robot.id())?;
+    let arm = Resource::new("slow-arm", ResourceClass::Module, "SlowArm").with_standstill(Duration::from_secs(60));
+    provider.create(arm).await?;
+    let requirements = vec![Requirement::new(ResourceOperation::Block, "SlowArm")];
+    bench.performer.perform(Command::Acquire { instance, requirements, priority: 0 })?;
+    match bench.event().await {
+        Some(Event::Granted { lease, .. }) => Ok((bench, lease, provider)),
+        other => bail!("{other:?}"),
+    }
+}
+
+/// How many leases that have ended the slow arm waits for, when the run does not hold it any more.
+async fn ending(provider: &ResourceClient) -> anyhow::Result<usize> {
+    loop {
+        let arm = provider.get("slow-arm").await?;
+        if arm.holdings.is_empty() {
+            return Ok(arm.ending.len());
+        }
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+}
+
+#[tokio::test]
+async fn a_lease_under_which_something_may_still_move_is_free_when_that_has_stopped() -> anyhow::Result<()> {
+    for is_lost in [false, true] {
+        let (mut bench, mut lease, provider) = with_slow_arm(InstanceId(1)).await?;
+        serve_arm(&mut bench).await?;
+        let (_server, endpoint) = serve(&bench, "picker.sock", Calling).await?;
+        let (tool, at) = serve(&bench, "tool.sock", Follow).await?;
+        // The goal of the worker calls another one, which is there or not.
+        let at = if is_lost { "unix:/nowhere/tool.sock".to_owned() } else { at };
+        let resource = |kind: &str, endpoint: &str| LeasedResource {
+            id: kind.to_lowercase(),
+            kind: kind.to_owned(),
+            endpoint: endpoint.to_owned(),
+            superclasses: Vec::new(),
+        };
+        lease.resources.extend([resource("Arm", &endpoint), resource("Tool", &at)]);
+        let Command::Start { instance, attempt, mut goal } = start(InstanceId(1), 1, "pick", lease.id, "") else {
+            bail!("it is a start")
+        };
+        goal.lease = Some(lease.clone());
+        bench.performer.perform(Command::Start { instance, attempt, goal })?;
+        let event = bench.event().await;
+        let expected = if is_lost { "aborted" } else { SUCCESS };
+        assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == expected), "{event:?}");
+        bench.goes_on(InstanceId(1), lease.id, None)?;
+        assert_eq!(ending(&provider).await?, usize::from(is_lost));
+        assert_eq!(tool.running(), 0);
+        bench.performer.closed().await?;
+    }
+    Ok(())
+}
+
+/// `follow` ends at once.
+struct Follow;
+
+#[tonic::async_trait]
+impl Action for Follow {
+    fn name(&self) -> &str {
+        "follow"
+    }
+
+    async fn execute(&self, _: GoalContext) -> ActionResult {
+        Ok(GoalOutcome::success())
+    }
+}
+
+#[tokio::test]
+async fn who_comes_back_does_not_know_how_all_ended_that_was_begun_before() -> anyhow::Result<()> {
+    let instance = InstanceId(1);
+    for is_given_back in [false, true] {
+        let (bench, lease, provider) = with_slow_arm(instance).await?;
+        let run = bench.performer.run.clone();
+        let requirements = vec![Requirement::new(ResourceOperation::Block, "SlowArm")];
+        let mut ledger = ledger(&run, &[]);
+        ledger.command(&Command::Acquire { instance, requirements, priority: 0 });
+        let release = Command::Release { instance, lease: Some(lease.id), projection: None };
+        ledger.event(Timestamp(0), &Event::Granted { instance, lease });
+        // Task control is killed before it has given back what the log says, or before it has decided to.
+        if is_given_back {
+            ledger.command(&release);
+        }
+        ledger.event(Timestamp(0), &Event::Resumed { share: None });
+        let mut bench = bench.comes_back(true).await?;
+        bench.takes_up(ledger, &World::default()).await?;
+        if !is_given_back {
+            bench.performer.perform(release)?;
+        }
+        assert_eq!(ending(&provider).await?, 1);
+        bench.performer.closed().await?;
+    }
+    Ok(())
+}
 
 #[tokio::test]
 async fn who_comes_back_tells_a_goal_to_stop_that_may_not_have_been_told() -> anyhow::Result<()> {

@@ -189,6 +189,7 @@ async fn what_may_not_be_needed_is_not_refused_for_how_long_it_waits() -> anyhow
             resources: resources.clone(),
             trust: performer.trust.clone(),
             told: told.clone(),
+            doubtful: performer.goals.doubtful.clone(),
             whom: Whom { resources: resources.clone(), world: world.clone(), told: told.clone() },
             over: Arc::new(CancellationToken::new().drop_guard()),
         };
