@@ -4,10 +4,9 @@
 //! hand, the fingers and what they hold with objects of the scene, never of the other links of the arm, nor with the robot itself, a box to keep
 //! out of, or a cloud. On straight parts the fingers and what they hold may press whatever they touch at the contact end (`pressing`).
 
-use super::{Checker, Collision, Entry, Other, Role};
+use super::{Checker, Collision, Entry, Other, RESOLUTION_M, Role};
 use crate::distance;
 use crate::joint_vector::JointVector;
-use crate::validate::RESOLUTION_M;
 
 /// A part of the gripper that is inside an object.
 #[derive(Debug, Clone, Copy, PartialEq)]
