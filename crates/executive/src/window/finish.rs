@@ -283,10 +283,11 @@ impl Window {
         }
     }
 
-    /// Whether a routine goes on in the turn of its line, because what it does is real at once. Others go on by themselves.
+    /// Whether a routine goes on in the turn of its line, because what it does is real at once. Others go on by themselves, also one that its line has
+    /// passed over.
     pub(super) fn goes_on_in_turn(&self, id: InstanceId) -> bool {
-        let is_head = self.graph.get(id).is_some_and(|instance| instance.is_head);
-        is_head && self.status_of_routine(id).is_some_and(Interpreter::is_actual)
+        let is_in_line = self.graph.get(id).is_some_and(|instance| instance.is_head && !instance.is_detached());
+        is_in_line && self.status_of_routine(id).is_some_and(Interpreter::is_actual)
     }
 
     /// Lets something happen inside of a routine under way; handles what comes of it.
