@@ -99,5 +99,5 @@ fn a_checkpoint_of_another_version_or_another_program_is_refused_as_that() {
     assert_eq!(refusal(&other, &bytes), Some(RestoreError::OtherProgram));
     bytes[0] += 1;
     let said = refusal(&own, &bytes).unwrap().to_string();
-    assert_eq!(said, "it is of format 11, and this version of ratn reads 10");
+    assert_eq!(said, "it is of format 13, and this version of ratn reads 12");
 }
