@@ -172,7 +172,7 @@ async fn a_goal_that_may_improve_its_result_gives_one_as_soon_as_it_will_do_and_
             given.push(better);
         },
     );
-    let last = last.await.unwrap();
+    let last = last.await.unwrap().outcome;
     assert!(last.is_success(), "{}", last.reason);
     assert!(!given.is_empty(), "nothing was given before the end");
     // It goes on for a second at the least.
@@ -192,7 +192,7 @@ async fn a_goal_with_a_budget_gives_its_result_when_that_is_over_and_ends() {
     let goal = Goal { improves: Some(Vec::new()), ..goal };
     let mut given = 0;
     let heard = |said| given += usize::from(matches!(said, Said::Improved(_)));
-    assert!(system.client.execute_hearing(&system.planner, goal, || true, heard).await.unwrap().is_success());
+    assert!(system.client.execute_hearing(&system.planner, goal, || true, heard).await.unwrap().outcome.is_success());
     assert_eq!(given, 0);
 }
 
