@@ -33,7 +33,7 @@ use std::sync::Arc;
 
 mod touching;
 
-pub(crate) use touching::{Against, Touch};
+pub(crate) use touching::{Press, Touch};
 
 /// Clearance that the planner keeps around the moving shapes at the start and the end, in metres.
 pub const PADDING_M: f64 = crate::arm::OVERHANG_M;
@@ -46,6 +46,9 @@ const ROUNDED: f64 = 1e-5;
 
 /// Maximum distance that a point moves in one of the [`steps`](Checker::steps) of a motion if there is no padding, in metres.
 const UNPADDED_STEP_M: f64 = 0.005;
+
+/// Maximum share of the radius of a cloud's balls by which they may be pressed: what was seen is at their centres, and is not touched.
+const IN_BALLS: f64 = 0.9;
 
 /// Without padding, a contact less deep than this may be missed on a motion, in metres.
 pub(crate) const RESOLUTION_M: f64 = 5e-4;
@@ -612,7 +615,7 @@ impl<'a> Checker<'a> {
                 }
             }
             let room = match contact {
-                Contact::Gripper(press) if self.can_press(i) => -press,
+                Contact::Gripper(_) if self.can_press(i) => -self.may_press(i, Other::Cloud, contact),
                 _ => self.padding,
             };
             if self.gap_to_cloud(i, room) < room {
@@ -658,6 +661,10 @@ impl<'a> Checker<'a> {
     fn may_press(&self, i: usize, other: Other, contact: Contact) -> f64 {
         match contact {
             Contact::Gripper(press) if self.can_press(i) && self.entry(other) == Entry::Never => press.min(0.0),
+            Contact::Gripper(press) if self.can_press(i) && matches!(other, Other::Cloud) => {
+                let radius_m = self.cloud.as_ref().map_or(0.0, |cloud| cloud.radius_m());
+                press.min(IN_BALLS * radius_m)
+            }
             Contact::Gripper(press) if self.can_press(i) => press,
             _ => 0.0,
         }

@@ -6,7 +6,7 @@
 //!
 //! Fingers and what they hold are fixed to the tool, so their contacts depend on the tool's pose alone, not on the posture of the elbow.
 
-use crate::collision::{Against, Checker, Collision, Contact, between};
+use crate::collision::{Checker, Collision, Contact, Press, between};
 use crate::joint_vector::JointVector;
 use crate::leaving::GROWS_M;
 use std::collections::BTreeMap;
@@ -15,7 +15,7 @@ use std::collections::BTreeMap;
 #[derive(Debug, Clone)]
 pub(crate) struct Pressing {
     press_m: f64,
-    least_m: BTreeMap<(usize, Against), f64>,
+    least_m: BTreeMap<(usize, usize), f64>,
 }
 
 impl Pressing {
@@ -26,7 +26,10 @@ impl Pressing {
     pub(crate) fn at(checker: &mut Checker<'_>, end: &JointVector, press_m: f64) -> Result<Pressing, Collision> {
         match checker.collision(end, Contact::Gripper(press_m)) {
             Some(collision) => Err(collision),
-            None => Ok(Pressing { press_m, least_m: checker.presses().into_iter().collect() }),
+            None => {
+                let least_m = checker.presses().iter().map(|press| (press.pair, press.depth_m)).collect();
+                Ok(Pressing { press_m, least_m })
+            }
         }
     }
 
@@ -52,22 +55,21 @@ impl Pressing {
         let steps = checker.steps_of_presses(from, to);
         (1..=steps).try_for_each(|i| {
             checker.place(&between(from, to, i as f64 / steps as f64));
-            self.comes(&checker.presses()).map_err(|(what, depth_m)| checker.pressed(what, depth_m))
+            self.comes(&checker.presses()).map_err(|press| checker.pressed(&press))
         })
     }
 
     /// The contacts in the next posture; the error is the one that is new or deeper.
-    fn comes(&mut self, presses: &[((usize, Against), f64)]) -> Result<(), ((usize, Against), f64)> {
-        let now: BTreeMap<(usize, Against), f64> = presses.iter().copied().collect();
-        for (what, least_m) in &mut self.least_m {
-            let depth_m = now.get(what).copied().unwrap_or(0.0);
-            if depth_m > *least_m + GROWS_M {
-                return Err((*what, depth_m));
-            }
-            *least_m = least_m.min(depth_m);
+    fn comes(&mut self, presses: &[Press]) -> Result<(), Press> {
+        let least_m = |press: &Press| self.least_m.get(&press.pair).copied().unwrap_or(0.0);
+        if let Some(press) = presses.iter().find(|press| press.depth_m > least_m(press) + GROWS_M) {
+            return Err(*press);
         }
-        let is_new = |(what, depth_m): &((usize, Against), f64)| !self.least_m.contains_key(what) && *depth_m > GROWS_M;
-        presses.iter().copied().find(is_new).map_or(Ok(()), Err)
+        let now: BTreeMap<(usize, usize), f64> = presses.iter().map(|press| (press.pair, press.depth_m)).collect();
+        for (pair, least_m) in &mut self.least_m {
+            *least_m = least_m.min(now.get(pair).copied().unwrap_or(0.0));
+        }
+        Ok(())
     }
 }
 

@@ -12,6 +12,7 @@ use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::arm;
+use ratn_motion::cloud::Cloud;
 use ratn_motion::collision::{Checker, Collision, Contact};
 use ratn_motion::geometry::Geometry;
 use ratn_motion::joint_vector::JointVector;
@@ -21,6 +22,7 @@ use ratn_motion::pace::Control;
 use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
 use ratn_motion::reach::{Reach, Target};
 use ratn_motion::robot::{Configuration, Joint, Robot};
+use ratn_motion::seen::Seen;
 use ratn_motion::straight::{Frame, Straight};
 use ratn_motion::timing::{Section, timed};
 use ratn_motion::trajectory::{Curve, Knot};
@@ -28,6 +30,7 @@ use ratn_motion::way_points::WayPoints;
 use ratn_world::scene::{Placement, SceneObject, Shape};
 use robots::Arm;
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4};
+use std::sync::Arc;
 
 /// How far a straight part may be from straight, in metres and radians.
 const STRAIGHT_M: f64 = 1e-3;
@@ -489,6 +492,29 @@ fn a_neighbour_that_is_pressed_at_the_goal_may_be_pressed_on_the_whole_straight_
         for planned in up_and_down(&cell) {
             planned.unwrap_or_else(|error| panic!("{press_m}: {error}"));
         }
+    }
+}
+
+#[test]
+fn what_is_held_goes_up_and_down_beside_what_a_camera_has_seen_and_not_into_it() {
+    let crate_ = (Shape::Box { size: [0.16, 0.07, 0.06] }, Pose::IDENTITY);
+    // A tall wall, of which the planner forgets what is near the robot and what it holds.
+    for (gap_m, passes) in [(0.007, true), (-0.003, false)] {
+        let nothing = (Shape::Sphere { radius: 0.001 }, Pose::at(0.0, 0.0, 0.8));
+        let cell = holding([crate_, nothing]);
+        let tool = cell.robot.tool_pose(&cell.state());
+        let place = |i: i32, j: i32| Pose::at(0.08 + gap_m, f64::from(j) * 0.005, f64::from(i) * 0.005);
+        let points: Vec<[f32; 3]> = (-60..=0)
+            .flat_map(|i| (-8..=8).map(move |j| (i, j)))
+            .map(|(i, j)| tool.compose(&place(i, j)).position.map(|c| c as f32))
+            .collect();
+        let cloud = Arc::new(Cloud::new("seen", &points, 0.01).unwrap());
+        let seen = Some(Seen { cloud, known_within_m: 0.02 });
+        let up =
+            Request { depart: Straight::up(0.1), seen, ..request(cell.state(), vec![Goal::Joints(aimm::OBSERVATION)]) };
+        let planned = cell.plan(&up);
+        let said = planned.as_ref().map_or_else(ToString::to_string, |_| String::new());
+        assert!(planned.is_ok() == passes && (passes || said.contains("seen")), "{gap_m}: {said}");
     }
 }
 

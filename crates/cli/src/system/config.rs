@@ -559,7 +559,9 @@ mod tests {
         let bare = of("");
         assert!(!bare.has_cell() && !bare.promised_resources().contains_key("Arm"));
         assert_eq!(bare.offered_by_nobody()["Arm"], ["arm"]);
-        assert!(!bare.offered_by_nobody().contains_key(PATH_PLANNER));
+        // This config has no template at all.
+        assert!(bare.offered_by_nobody().contains_key(PATH_PLANNER));
+        assert!(!of(&template(PATH_PLANNER)).offered_by_nobody().contains_key(PATH_PLANNER));
         assert!(!of(&template("Arm")).offered_by_nobody().contains_key("Arm"));
         let below = "[resource-manager.kinds]\nShortArm = [\"Arm\"]\n";
         assert!(!of(&(template("ShortArm") + below)).offered_by_nobody().contains_key("Arm"));

@@ -51,11 +51,12 @@ impl Window {
         unmet.flatten()
     }
 
-    /// Whether a node is under way where the sequential program would also be at it, because everything before it in its region has ended. Then it goes
-    /// on, whatever others change meanwhile: of a routine the parts that have not begun find the changes.
+    /// Whether a node is under way where the sequential program would also be at it: everything before it in its region has ended, and what runs ahead
+    /// has had its turn since. Then it goes on, whatever others change meanwhile: of a routine the parts that have not begun find the changes.
     pub(super) fn goes_on(&mut self, context: &Context<'_>, id: InstanceId) -> bool {
         let is_at_its_place = self.graph.get(id).is_some_and(|instance| {
-            instance.is_head && instance.is_under_way() && self.older_beside(instance).is_none()
+            let has_come = instance.is_pia() || instance.node().is_some_and(|node| node.is_at_its_place);
+            has_come && instance.is_head && instance.is_under_way() && self.older_beside(instance).is_none()
         });
         if is_at_its_place && let Some(routine) = self.graph.interpreter(id) {
             routine.project_anew(context.root);

@@ -7,6 +7,7 @@
 use super::{Checker, Collision, Entry, Other, RESOLUTION_M, Role};
 use crate::distance;
 use crate::joint_vector::JointVector;
+use std::collections::BTreeMap;
 
 /// A part of the gripper that is inside an object.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -20,44 +21,44 @@ pub(crate) struct Touch {
     pub(crate) depth_m: f64,
 }
 
-/// Something that fingers, or what they hold, may press.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Against {
-    /// An obstacle, by its index in the checker.
-    Obstacle(usize),
-    /// A ball of the cloud.
-    Ball(usize),
+/// A contact of a finger, or of what it holds, with an obstacle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Press {
+    /// The link, which is rigid though it may have several shapes, and the obstacle: indices in the checker.
+    pub(crate) pair: (usize, usize),
+    /// The shape of the link that is deepest.
+    shape: usize,
+    /// Penetration in metres, without any padding.
+    pub(crate) depth_m: f64,
 }
 
 impl<'a> Checker<'a> {
-    /// What fingers, and what they hold, are in in the posture checked last, and how deep, in metres, without any padding. Fingers are in no hollow
-    /// object.
-    pub(crate) fn presses(&self) -> Vec<((usize, Against), f64)> {
-        let mut presses = Vec::new();
+    /// What fingers, and what they hold, are in in the posture checked last, one contact for each link and obstacle. Fingers are in no hollow object. A
+    /// cloud is in none: its balls are larger than what was seen, which lies at their centres.
+    pub(crate) fn presses(&self) -> Vec<Press> {
+        let mut presses: BTreeMap<(usize, usize), Press> = BTreeMap::new();
         for i in (0..self.moving.len()).filter(|i| self.can_press(*i)) {
             for &o in self.moving[i].obstacles.iter().filter(|o| !self.is_in_hollow(i, **o)) {
-                let depth_m = self.depth_in(i, o);
-                if depth_m > 0.0 {
-                    presses.push(((i, Against::Obstacle(o)), depth_m));
+                let press = Press { pair: (self.moving[i].link, o), shape: i, depth_m: self.depth_in(i, o) };
+                if press.depth_m > 0.0 {
+                    let deepest = presses.entry(press.pair).or_insert(press);
+                    if press.depth_m > deepest.depth_m {
+                        *deepest = press;
+                    }
                 }
             }
-            let Some(cloud) = &self.cloud else { continue };
-            let (solid, radius) = (&self.moving[i].solid, cloud.radius_m() as f32);
-            cloud.visit_near(&self.placed[i], &solid.shape, solid.inside.as_deref(), radius, &mut |ball, gap| {
-                presses.push(((i, Against::Ball(ball)), f64::from(radius - gap)));
-                true
-            });
         }
-        presses
+        presses.into_values().collect()
     }
 
-    /// The contact of a moving shape, at this depth, as it is reported in messages.
-    pub(crate) fn pressed(&self, (i, against): (usize, Against), depth_m: f64) -> Collision {
-        let other = match against {
-            Against::Obstacle(o) => self.obstacles[o].name.clone(),
-            Against::Ball(_) => self.cloud.as_ref().map(|cloud| cloud.name.clone()).unwrap_or_default(),
-        };
-        Collision { moving: self.moving[i].name.clone(), other, depth_m, padding_m: 0.0 }
+    /// The contact, as it is reported in messages.
+    pub(crate) fn pressed(&self, press: &Press) -> Collision {
+        self.contact(press.shape, press.pair.1, press.depth_m)
+    }
+
+    fn contact(&self, i: usize, o: usize, depth_m: f64) -> Collision {
+        let (moving, other) = (self.moving[i].name.clone(), self.obstacles[o].name.clone());
+        Collision { moving, other, depth_m, padding_m: 0.0 }
     }
 
     /// Number of equal steps into which the motion between two close postures must be cut so that in one step no shape that may press something
@@ -73,7 +74,7 @@ impl<'a> Checker<'a> {
             let moves_m = f64::from((self.centres[i] - was).length() + turned * moving.radius);
             let is_near =
                 |o: &usize| self.is_within(i, *o, moves_m) && self.apart_m(i, Other::Obstacle(*o), moves_m) < moves_m;
-            if moving.obstacles.iter().any(is_near) || self.gap_to_cloud(i, moves_m) < moves_m {
+            if moving.obstacles.iter().any(is_near) {
                 steps = steps.max((moves_m / RESOLUTION_M).ceil() as usize);
             }
         }
@@ -120,7 +121,7 @@ impl<'a> Checker<'a> {
 
     /// The touch, at this depth, as it is reported in messages.
     pub(crate) fn told(&self, touch: &Touch, depth_m: f64) -> Collision {
-        self.pressed((touch.moving, Against::Obstacle(touch.obstacle)), depth_m)
+        self.contact(touch.moving, touch.obstacle, depth_m)
     }
 
     /// Whether an obstacle is an object of the scene that may be touched.

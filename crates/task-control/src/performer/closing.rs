@@ -1,6 +1,7 @@
 //! The end of a run: what it decided is recorded, what it holds is given back, and its session ends.
 
 use super::Performer;
+use super::goal::CANCEL_DEADLINE;
 use crate::ledger::Confirmed;
 use crate::record::{self, Record};
 use anyhow::bail;
@@ -9,8 +10,10 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::oneshot;
 
-/// Time limit at the end of a run for everything that is still being recorded or given back.
+/// Time limit at the end of a run for everything that is still being recorded.
 pub(super) const CLOSE_DEADLINE: Duration = Duration::from_secs(3);
+/// Time limit at the end of a run for everything that is still being given back: a lease goes back when its cancelled goals have ended, or are abandoned.
+const BACK_DEADLINE: Duration = CANCEL_DEADLINE.saturating_add(Duration::from_secs(1));
 /// Time limit at the end of a run for its operations, and for the leases that have to be back before something is used up or deleted: longer than an
 /// absent resource manager is waited for.
 const RETURN_DEADLINE: Duration = Duration::from_secs(15);
@@ -60,7 +63,7 @@ impl Performer {
             () = in_time => Err(self.recording.get()),
         };
         let giving_back = async { while self.giving_back.join_next().await.is_some() {} };
-        if tokio::time::timeout(CLOSE_DEADLINE, giving_back).await.is_err() {
+        if tokio::time::timeout(BACK_DEADLINE, giving_back).await.is_err() {
             tracing::warn!("what was left at the end of the run was not given back in time");
         }
         // Whoever gets the resources now changes the world; what was not recorded in time is never recorded.

@@ -29,7 +29,7 @@ use tokio_util::sync::CancellationToken;
 
 /// A cancelled goal whose provider does not end it within this time is abandoned: what it moves may still move. A provider says after its grace that a
 /// goal has not ended.
-const CANCEL_DEADLINE: Duration = STOP_GRACE.saturating_add(Duration::from_millis(500));
+pub(super) const CANCEL_DEADLINE: Duration = STOP_GRACE.saturating_add(Duration::from_millis(500));
 /// How long a goal goes on without task control, so that a resumed run finds it under way: as long as its lease would live.
 pub(super) const GRACE_MS: u64 = DEFAULT_TTL.as_millis() as u64;
 /// How long the resource of a provider that has ended may still exist: its process manager withdraws it at once, and if that has ended too, the
@@ -243,7 +243,11 @@ impl Performing {
     async fn ending(&self, endpoint: &Endpoint, given: Given) -> Event {
         match given {
             Given::Now => self.given(endpoint).await,
-            Given::Before | Given::ToStop => Box::pin(self.found(endpoint)).await,
+            Given::Before | Given::ToStop => match Box::pin(self.found(endpoint)).await {
+                // A process that was started again refuses what was granted before it: the one before may have begun the goal.
+                Event::Crashed { reason, refused: true, .. } => self.unknown(reason),
+                event => event,
+            },
         }
     }
 
@@ -268,13 +272,15 @@ impl Performing {
             Err(error) if error.code() == Some(tonic::Code::NotFound) => {
                 self.unknown(format!("nobody knows what became of it while task control was gone: {}", said(&error)))
             }
-            // It may be under way: whoever implements no `Attach` keeps none of its goals.
-            Err(error) if error.code() == Some(tonic::Code::Unimplemented) => {
-                let _ = tokio::time::timeout(CANCEL_DEADLINE, self.actions.stop(endpoint, &self.goal.id)).await;
-                self.unknown("its worker does not know which goals it was given before (it has no `Attach`)".to_owned())
-            }
+            Err(error) if error.code() == Some(tonic::Code::Unimplemented) => self.left_alone(endpoint).await,
             Err(error) => self.lost(endpoint, &error).await,
         }
+    }
+
+    /// A goal that may be under way at a worker that keeps none of its goals, because it implements no `Attach`: it is told to stop.
+    async fn left_alone(&self, endpoint: &Endpoint) -> Event {
+        let _ = tokio::time::timeout(CANCEL_DEADLINE, self.actions.stop(endpoint, &self.goal.id)).await;
+        self.unknown("its worker does not know which goals it was given before (it has no `Attach`)".to_owned())
     }
 
     async fn given(&self, endpoint: &Endpoint) -> Event {
@@ -353,6 +359,7 @@ impl Performing {
         match fate.inspect(|fate| self.heard(fate)) {
             Ok(fate) if !fate.orphaned => self.finished(fate.outcome),
             Err(error) if error.is_unreadable() => self.unreadable(endpoint, &error).await,
+            Err(error) if error.code() == Some(tonic::Code::Unimplemented) => self.left_alone(endpoint).await,
             _ => self.lost(endpoint, broken).await,
         }
     }

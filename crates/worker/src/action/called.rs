@@ -123,9 +123,12 @@ async fn perform(
     };
     match fate {
         Ok(fate) => (Ok(fate.outcome), !fate.may_move),
-        // A provider that refuses a goal has not begun it.
+        // A provider that refuses a goal has not begun it. Of what cannot be read or has broken nothing is known.
         Err(error) => {
-            let is_known = !error.is_crash();
+            let is_known = !error.is_crash() && !error.is_unreadable();
+            if !is_known {
+                let _ = tokio::time::timeout(STOPS_WITHIN, client.stop(endpoint, &id)).await;
+            }
             (Err(error), is_known)
         }
     }
