@@ -233,7 +233,11 @@ fn a_smooth_way_is_taken_where_it_is_quicker_and_only_what_is_free() {
         path.windows(2).map(from_side).fold(f64::INFINITY, f64::min)
     };
     let with_room = curve(&mut |_, _| true);
-    let with_little = curve(&mut |from, to| off(from).max(off(to)) < 0.01);
+    // All of a chord, which is furthest off where it crosses the bisector of a corner.
+    let along = |from: &JointVector, to: &JointVector, share: f64| {
+        JointVector::from_fn(2, |j| from[j] + (to[j] - from[j]) * share)
+    };
+    let with_little = curve(&mut |from, to| (0..=32).all(|i| off(&along(from, to, f64::from(i) / 32.0)) < 0.01));
     let stops = curve(&mut |_, _| false);
     let [most, less, least] = [&with_room, &with_little, &stops].map(|curve| curve.duration_s());
     assert!(most < less - 0.05 && less < least * 0.95, "{most} {less} {least}");

@@ -497,13 +497,13 @@ fn a_neighbour_that_is_pressed_at_the_goal_may_be_pressed_on_the_whole_straight_
 
 #[test]
 fn what_is_held_goes_up_and_down_beside_what_a_camera_has_seen_and_not_into_it() {
-    let crate_ = (Shape::Box { size: [0.16, 0.07, 0.06] }, Pose::IDENTITY);
+    let crate_ = (Shape::Box { size: [0.44, 0.07, 0.06] }, Pose::IDENTITY);
     // A tall wall, of which the planner forgets what is near the robot and what it holds.
     for (gap_m, passes) in [(0.007, true), (-0.003, false)] {
-        let nothing = (Shape::Sphere { radius: 0.001 }, Pose::at(0.0, 0.0, 0.8));
+        let nothing = (Shape::Box { size: [0.01; 3] }, Pose::at(0.0, 0.0, 0.8));
         let cell = holding([crate_, nothing]);
         let tool = cell.robot.tool_pose(&cell.state());
-        let place = |i: i32, j: i32| Pose::at(0.08 + gap_m, f64::from(j) * 0.005, f64::from(i) * 0.005);
+        let place = |i: i32, j: i32| Pose::at(0.22 + gap_m, f64::from(j) * 0.005, f64::from(i) * 0.005);
         let points: Vec<[f32; 3]> = (-60..=0)
             .flat_map(|i| (-8..=8).map(move |j| (i, j)))
             .map(|(i, j)| tool.compose(&place(i, j)).position.map(|c| c as f32))

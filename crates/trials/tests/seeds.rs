@@ -14,6 +14,9 @@ const NOT_COUNTED: &str = "successes: None, ";
 /// The same of one without results that get better.
 const NOT_ANYTIME: &str = "anytime: false, ";
 
+/// The same of one without a hierarchy of kinds.
+const NO_KINDS: &str = "kinds: {}, ";
+
 /// The same of one whose conditions and loops have no outputs.
 const NO_OUTPUTS: &str = ", outputs: []";
 
@@ -39,7 +42,8 @@ fn fingerprint(features: &Features) -> u64 {
             .replace(NO_GUARDS, "")
             .replace(NOT_WATCHED, "")
             .replace(NOT_COUNTED, "")
-            .replace(NOT_ANYTIME, "");
+            .replace(NOT_ANYTIME, "")
+            .replace(NO_KINDS, "");
         for byte in without_outputs(&program).bytes() {
             sum.0 = (sum.0 ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
         }
