@@ -294,9 +294,8 @@ impl<const N: usize> Problem<N> {
                         mapped[q] += rows[r][a] * h[r][q];
                     }
                 }
-                for b in a..3 {
-                    let value: f64 = (0..3).map(|q| mapped[q] * rows[q][b]).sum();
-                    system.bands[place.first + a][b - a] += value;
+                for (band, b) in system.bands[place.first + a].iter_mut().zip(a..3) {
+                    *band += rows.iter().zip(mapped).map(|(row, mapped)| mapped * row[b]).sum::<f64>();
                 }
             }
         }
@@ -321,11 +320,11 @@ impl<const N: usize> Problem<N> {
             let (at, by) = (place.triple(full), place.triple(way));
             // Along the tangent of the root.
             let falls = 0.5 * by[0] / (at[0] * at[0].sqrt());
-            for j in 0..self.joints {
+            for (j, changes) in places[i].iter_mut().enumerate().take(self.joints) {
                 let slacks = place.slacks(&at, j);
                 let (a, y) = (place.acceleration(&by, j), place.jerk(&by, j));
                 let steps = [-a, a, -falls - y, y - falls];
-                places[i][j] = std::array::from_fn(|k| change(slacks[k], steps[k], multipliers.places[i][j][k]));
+                *changes = std::array::from_fn(|k| change(slacks[k], steps[k], multipliers.places[i][j][k]));
             }
         }
         (PerLimit { positive, speeds, places }, rooms)
