@@ -145,7 +145,7 @@ def test_a_resource_is_held_for_a_block_and_nobody_else_gets_it(system: ratn.Sys
         assert lease.alive and [kind for _, kind, _ in lease.resources] == ["Camera"]
         assert [resource["held"] for resource in system.resources("Camera")] == [True]
         with pytest.raises(ratn.DeadlineExceeded) as late:
-            system.acquire("Camera", timeout_s=0.2)
+            system.acquire("Camera", timeout_s=0.5)
         assert late.value.code == "DEADLINE_EXCEEDED" and "Camera" in str(late.value)
     assert [resource["held"] for resource in system.resources("Camera")] == [False]
     assert lease.release() is False
