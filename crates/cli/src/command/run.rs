@@ -55,7 +55,7 @@ pub(crate) fn run(arguments: &RunArguments, tls: &ClientTls) -> Result<(), Failu
             (Some(log), task) => {
                 Box::pin(resume::run(arguments, log, task.as_deref(), &directory, tls, &interrupt)).await
             }
-            (None, Some(task)) => Box::pin(begin(arguments, task, &directory, tls, &interrupt)).await,
+            (None, Some(task)) => begin(arguments, task, &directory, tls, &interrupt).await,
             (None, None) => Err(Failure::Refused("ratn: no task file is named".to_owned())),
         }
     })
@@ -81,6 +81,24 @@ async fn begin(
     tls: &ClientTls,
     interrupt: &Interrupt,
 ) -> Result<(), Failure> {
+    let mut started = None;
+    let ended = Box::pin(begin_on(&mut started, arguments, task, directory, tls, interrupt)).await;
+    // The run was refused behind the start of its system.
+    if let Some(system) = started {
+        system.stop().await;
+    }
+    ended
+}
+
+/// Runs the task on the system that is there, or on one of its own: in `started` if that was started before the run was known to be accepted.
+async fn begin_on(
+    started: &mut Option<System>,
+    arguments: &RunArguments,
+    task: &Path,
+    directory: &Path,
+    tls: &ClientTls,
+    interrupt: &Interrupt,
+) -> Result<(), Failure> {
     let robot = arguments.robot.as_deref();
     let given = arguments.config.as_deref().map(|file| SystemConfig::load_for(Some(file), robot)).transpose()?;
     let tls = &given.as_ref().map_or_else(|| Ok(tls.clone()), |config| config.client_tls(tls))?;
@@ -97,30 +115,19 @@ async fn begin(
     };
     config.apply(&SystemArguments { speed: arguments.speed, ..SystemArguments::default() });
 
-    // Everything that can be refused is refused before anything is started.
+    // What can be refused without a system is refused before one is started.
     if let Some(system) = &found {
         system.mismatches.iter().for_each(|what| output::progress(format_args!("warning: {what}")));
     }
     let from = arguments.from.as_deref();
-    let mut started = None;
     let program = match &mut found {
         Some(system) => Box::pin(described::program(task, from, system, interrupt)).await?,
         None => match check::found(task, from, &config.catalogue)? {
             Ok(program) => program,
             // A worker of this config may say it of itself once it runs.
             Err(findings) if described::is_lacking(&findings) && config.starts_other_programs() => {
-                let mut system = start(&config, tls, directory, interrupt).await?;
-                let program = Box::pin(described::program(task, from, &mut system, interrupt)).await;
-                match program {
-                    Ok(program) => {
-                        started = Some(system);
-                        program
-                    }
-                    Err(refused) => {
-                        system.stop().await;
-                        return Err(refused);
-                    }
-                }
+                let system = started.insert(start(&config, tls, directory, interrupt).await?);
+                Box::pin(described::program(task, from, system, interrupt)).await?
             }
             Err(findings) => return Err(check::refused(&findings)),
         },
@@ -162,7 +169,7 @@ async fn begin(
             }
             system
         }
-        None => match started {
+        None => match started.take() {
             Some(system) => system,
             None => start(&config, tls, directory, interrupt).await?,
         },
