@@ -13,7 +13,7 @@
 
 use crate::cloud::Cloud;
 use crate::confirmed::Couples;
-use crate::frame::{compose, norm};
+use crate::frame::compose;
 use crate::joint_vector::JointVector;
 use crate::keep::Region;
 use crate::levers::{Chain, Levers};
@@ -24,6 +24,7 @@ use crate::robot::{Configuration, Geometry, Robot, to_f32};
 use crate::robot_model::Joint;
 use crate::solid::{Placed, Solid};
 use crate::space::Obstacle as Standing;
+use crate::vector::transform;
 use parry3d::math::{Pose as Pose32, Vector};
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Scene, Shape};
@@ -368,8 +369,8 @@ impl<'a> Checker<'a> {
     fn farthest(&self, joints: &[Joint], chain_to: impl Fn(usize) -> Chain) -> JointVector {
         let levers_of = |moving: &Moving| {
             let chain = chain_to(moving.frame);
-            let middle = moving.middle.to_array().map(f64::from);
-            let end_m = norm(chain.tip.compose(&moving.local).transform(middle)) + f64::from(moving.radius);
+            let middle = transform(&chain.tip.compose(&moving.local), moving.middle.as_dvec3());
+            let end_m = middle.length() + f64::from(moving.radius);
             let levers = Levers::new(&chain.joints, end_m, joints);
             (chain, levers)
         };

@@ -6,14 +6,14 @@
 //! it has to give up, the result is the largest distance that is proven. Balls and capsules are a point and a segment with a radius, which is
 //! exact. Of a mesh only the surface counts; the trees of parry3d find the triangles that matter, for two meshes both at once.
 
-use crate::frame::{cross, difference, norm, rotate};
 use crate::mesh::ConvexPiece;
+use crate::vector::Vector;
+use glam::DMat3;
 use parry3d::bounding_volume::Aabb;
-use parry3d::math::{Pose as Pose32, Vector};
+use parry3d::math::{Pose as Pose32, Vector as Vector32};
 use parry3d::partitioning::BvhNode;
 use parry3d::query::{self, DefaultQueryDispatcher, PointQuery, QueryDispatcher};
 use parry3d::shape::{Shape, TriMesh};
-use ratn_model::pose::Pose;
 use std::cell::Cell;
 
 /// Maximum number of steps of a search. Shapes whose sizes differ by a factor of a hundred take forty.
@@ -31,8 +31,6 @@ const ROUGH_M: f32 = 0.02;
 
 /// Four corners lie in a plane if their volume is a smaller fraction than this of the volume of a box with their edges.
 const FLAT: f64 = 1e-12;
-
-type Point = [f64; 3];
 
 /// Distance of two shapes in metres, or any value greater than `enough_m` if it is more than that. Zero or less if they touch: then [`depth`]
 /// returns the penetration. `None` if it cannot be computed.
@@ -63,7 +61,7 @@ pub fn depth(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> f64 
     if cores > 0.0 {
         return (radii - cores).max(0.0);
     }
-    let found = contact.map(|contact| contact.normal1.to_array().map(f64::from));
+    let found = contact.map(|contact| contact.normal1.as_dvec3());
     least_overlap(&first, &second, found).map_or(0.0, |(_, overlap)| overlap.max(0.0))
 }
 
@@ -72,61 +70,61 @@ pub fn depth(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> f64 
 /// apart, `None` if the other shape is no primitive.
 pub(crate) fn depth_of_piece(a_at: &Pose32, piece: &ConvexPiece, b_at: &Pose32, b: &dyn Shape) -> Option<f64> {
     let second = Turned::new(Round::of(b)?, &a_at.inv_mul(b_at));
-    let extent = |way: Point| piece.corners.iter().map(|corner| dot(*corner, way)).fold(f64::NEG_INFINITY, f64::max);
-    let middle =
-        piece.corners.iter().fold([0.0; 3], |at, corner| sum(at, *corner)).map(|c| c / piece.corners.len() as f64);
+    let extent = |way: Vector| {
+        piece.corners.iter().map(|corner| way.dot(Vector::from(*corner))).fold(f64::NEG_INFINITY, f64::max)
+    };
+    let middle = piece.corners.iter().map(|corner| Vector::from(*corner)).sum::<Vector>() / piece.corners.len() as f64;
     let faces = second.round.core.axes().into_iter().map(|axis| second.rotate(axis));
-    let away =
-        second.round.core.lines().into_iter().map(|line| aside(difference(second.at, middle), second.rotate(line)));
-    let ways = faces.chain(away).chain([difference(second.at, middle)]).flat_map(|way| [way, way.map(|c| -c)]);
-    let overlap = |way: Point| {
-        let length = norm(way);
-        let way = way.map(|c| c / length);
-        (length > SAME_M).then(|| extent(way) + second.along(way.map(|c| -c)))
+    let away = second.round.core.lines().into_iter().map(|line| aside(second.at - middle, second.rotate(line)));
+    let ways = faces.chain(away).chain([second.at - middle]).flat_map(|way| [way, -way]);
+    let overlap = |way: Vector| {
+        let way = direction(way)?;
+        Some(extent(way) + second.along(-way))
     };
     ways.chain(piece.normals.iter().copied()).filter_map(overlap).min_by(f64::total_cmp)
 }
 
 /// Direction of the shortest known translation that moves the first of two touching shapes out of the other, a unit vector in the world frame.
 /// `None` if none is known.
-pub fn way_out(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> Option<Point> {
+pub fn way_out(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> Option<[f64; 3]> {
     let pose = a_at.inv_mul(b_at);
     let contact = DefaultQueryDispatcher.contact(&pose, a, b, ROUGH_M).ok().flatten();
-    let found = contact.map(|contact| contact.normal1.to_array().map(f64::from));
+    let found = contact.map(|contact| contact.normal1.as_dvec3());
     let to_second = match (Round::of(a), Round::of(b)) {
         (Some(first), Some(second)) => least_overlap(&first, &Turned::new(second, &pose), found)?.0,
         _ => found?,
     };
-    let [x, y, z] = to_second.map(|c| -c as f32);
-    let way = (a_at.rotation * Vector::new(x, y, z)).to_array().map(f64::from);
-    let length = norm(way);
-    (length > SAME_M).then(|| way.map(|c| c / length))
+    direction((a_at.rotation * -to_second.as_vec3()).as_dvec3()).map(|way| way.to_array())
 }
 
 /// The direction along which two shapes overlap least, and the overlap: the second shape leaves the first that way. The direction is a unit vector
 /// in the frame of the first shape. All directions that can be it are tried, and `found`.
-fn least_overlap(first: &Round, second: &Turned, found: Option<Point>) -> Option<(Point, f64)> {
-    let turned = |axes: Vec<Point>| axes.into_iter().map(|axis| second.rotate(axis)).collect::<Vec<Point>>();
+fn least_overlap(first: &Round, second: &Turned, found: Option<Vector>) -> Option<(Vector, f64)> {
+    let turned = |axes: Vec<Vector>| axes.into_iter().map(|axis| second.rotate(axis)).collect::<Vec<Vector>>();
     let (lines, its) = (first.core.lines(), turned(second.round.core.lines()));
     // Across faces, across pairs of edges or axes of both, away from an axis, and from middle to middle. Along any direction the overlap is an
     // upper bound of the penetration.
     let faces = [first.core.axes(), turned(second.round.core.axes())].concat();
-    let across = lines.iter().flat_map(|line| its.iter().map(|other| cross(*line, *other)));
+    let across = lines.iter().flat_map(|line| its.iter().map(|other| line.cross(*other)));
     let away = lines.iter().chain(&its).map(|line| aside(second.at, *line));
-    let ways = faces.into_iter().chain(across).chain(away).chain([second.at, [1.0, 0.0, 0.0]]).chain(found);
-    let ways = ways.flat_map(|way| [way, way.map(|c| -c)]);
-    let overlap = |way: Point| {
-        let length = norm(way);
-        let way = way.map(|c| c / length);
-        (length > SAME_M).then(|| (way, first.along(way) + second.along(way.map(|c| -c))))
+    let ways = faces.into_iter().chain(across).chain(away).chain([second.at, Vector::X]).chain(found);
+    let ways = ways.flat_map(|way| [way, -way]);
+    let overlap = |way: Vector| {
+        let way = direction(way)?;
+        Some((way, first.along(way) + second.along(-way)))
     };
     ways.filter_map(overlap).min_by(|(_, a), (_, b)| a.total_cmp(b))
 }
 
 /// The part of a vector that is perpendicular to a line.
-fn aside(vector: Point, line: Point) -> Point {
-    let along = dot(vector, line) / dot(line, line).max(f64::MIN_POSITIVE);
-    difference(vector, line.map(|c| c * along))
+fn aside(vector: Vector, line: Vector) -> Vector {
+    vector - line * (vector.dot(line) / line.length_squared().max(f64::MIN_POSITIVE))
+}
+
+/// The unit vector of a direction; `None` where the vector is too short to have one.
+fn direction(way: Vector) -> Option<Vector> {
+    let length = way.length();
+    (length > SAME_M).then(|| way / length)
 }
 
 /// As [`gap`], with the pose of the second shape in the frame of the first.
@@ -166,13 +164,13 @@ fn gap_of_meshes(pose: &Pose32, first: &TriMesh, second: &TriMesh, enough_m: f64
     // The trees round to `f32`.
     let beyond = (enough_m * (1.0 + ROUNDED) + ROUNDED_M) as f32;
     let best = Cell::new(beyond.min(some_gap(pose, first, second)));
-    let axes = [Vector::X, Vector::Y, Vector::Z].map(|axis| pose.rotation * axis);
+    let axes = [Vector32::X, Vector32::Y, Vector32::Z].map(|axis| pose.rotation * axis);
     let are_near = |a: &BvhNode, b: &BvhNode| {
         let (mine, its) = (a.aabb(), b.aabb());
         let half = its.half_extents();
         let around = axes[0].abs() * half.x + axes[1].abs() * half.y + axes[2].abs() * half.z;
         let middle = pose.transform_point(its.center()) - mine.center();
-        let between = (middle.abs() - around - mine.half_extents()).max(Vector::ZERO);
+        let between = (middle.abs() - around - mine.half_extents()).max(Vector32::ZERO);
         between.length() <= best.get() + ROUNDED_M as f32
     };
     for (a, b) in first.bvh().leaf_pairs(second.bvh(), are_near) {
@@ -201,10 +199,10 @@ fn some_gap(pose: &Pose32, first: &TriMesh, second: &TriMesh) -> f32 {
 #[derive(Debug, Clone, Copy)]
 enum Core {
     Point,
-    Segment([Point; 2]),
-    Triangle([Point; 3]),
+    Segment([Vector; 2]),
+    Triangle([Vector; 3]),
     /// Half extents.
-    Box(Point),
+    Box(Vector),
     /// Along y: radius and half length.
     Cylinder(f64, f64),
 }
@@ -220,104 +218,96 @@ struct Round {
 #[derive(Debug, Clone, Copy)]
 struct Turned {
     round: Round,
-    /// The axes of its frame.
-    axes: [Point; 3],
-    at: Point,
+    /// Its columns are the axes of its frame.
+    axes: DMat3,
+    at: Vector,
 }
 
 impl Core {
     /// The support point: the farthest along a direction.
-    fn farthest(&self, way: Point) -> Point {
-        let farthest = |corners: &[Point]| {
-            corners.iter().copied().max_by(|a, b| dot(*a, way).total_cmp(&dot(*b, way))).unwrap_or_default()
+    fn farthest(&self, way: Vector) -> Vector {
+        let farthest = |corners: &[Vector]| {
+            corners.iter().copied().max_by(|a, b| a.dot(way).total_cmp(&b.dot(way))).unwrap_or_default()
         };
         match self {
-            Core::Point => [0.0; 3],
+            Core::Point => Vector::ZERO,
             Core::Segment(ends) => farthest(ends),
             Core::Triangle(corners) => farthest(corners),
-            Core::Box(half) => std::array::from_fn(|i| half[i].copysign(way[i])),
+            Core::Box(half) => half.copysign(way),
             Core::Cylinder(radius, half_length) => {
-                let aside = way[0].hypot(way[2]);
+                let aside = way.x.hypot(way.z);
                 let out = if aside > 0.0 { radius / aside } else { 0.0 };
-                [way[0] * out, half_length.copysign(way[1]), way[2] * out]
+                Vector::new(way.x * out, half_length.copysign(way.y), way.z * out)
             }
         }
     }
 
     /// Directions of its edges, or its axis.
-    fn lines(&self) -> Vec<Point> {
-        let [x, y, z] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+    fn lines(&self) -> Vec<Vector> {
         match self {
             Core::Point => Vec::new(),
-            Core::Segment([a, b]) => vec![difference(*b, *a)],
-            Core::Triangle([a, b, c]) => vec![difference(*b, *a), difference(*c, *b), difference(*a, *c)],
-            Core::Box(_) => vec![x, y, z],
-            Core::Cylinder(..) => vec![y],
+            Core::Segment([a, b]) => vec![*b - *a],
+            Core::Triangle([a, b, c]) => vec![*b - *a, *c - *b, *a - *c],
+            Core::Box(_) => Vector::AXES.to_vec(),
+            Core::Cylinder(..) => vec![Vector::Y],
         }
     }
 
     /// Normals of its faces.
-    fn axes(&self) -> Vec<Point> {
-        let [x, y, z] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+    fn axes(&self) -> Vec<Vector> {
         match self {
             Core::Point | Core::Segment(_) => Vec::new(),
-            Core::Triangle([a, b, c]) => vec![cross(difference(*b, *a), difference(*c, *a))],
-            Core::Box(_) => vec![x, y, z],
-            Core::Cylinder(..) => vec![y],
+            Core::Triangle([a, b, c]) => vec![(*b - *a).cross(*c - *a)],
+            Core::Box(_) => Vector::AXES.to_vec(),
+            Core::Cylinder(..) => vec![Vector::Y],
         }
     }
 }
 
 impl Round {
     fn of(shape: &dyn Shape) -> Option<Round> {
-        let point = |v: Vector| v.to_array().map(f64::from);
         let sharp = |core: Core| Some(Round { core, radius: 0.0 });
         if let Some(ball) = shape.as_ball() {
             return Some(Round { core: Core::Point, radius: f64::from(ball.radius) });
         }
         if let Some(capsule) = shape.as_capsule() {
-            let core = Core::Segment([point(capsule.segment.a), point(capsule.segment.b)]);
+            let core = Core::Segment([capsule.segment.a, capsule.segment.b].map(Vector32::as_dvec3));
             return Some(Round { core, radius: f64::from(capsule.radius) });
         }
         if let Some(cuboid) = shape.as_cuboid() {
-            return sharp(Core::Box(point(cuboid.half_extents)));
+            return sharp(Core::Box(cuboid.half_extents.as_dvec3()));
         }
         if let Some(cylinder) = shape.as_cylinder() {
             return sharp(Core::Cylinder(f64::from(cylinder.radius), f64::from(cylinder.half_height)));
         }
         let triangle = shape.as_triangle()?;
-        sharp(Core::Triangle([triangle.a, triangle.b, triangle.c].map(point)))
+        sharp(Core::Triangle([triangle.a, triangle.b, triangle.c].map(Vector32::as_dvec3)))
     }
 
     /// Extent of the shape along a unit vector.
-    fn along(&self, way: Point) -> f64 {
-        dot(self.core.farthest(way), way) + self.radius
+    fn along(&self, way: Vector) -> f64 {
+        self.core.farthest(way).dot(way) + self.radius
     }
 }
 
 impl Turned {
     fn new(round: Round, pose: &Pose32) -> Turned {
-        let quaternion = pose.rotation.to_array().map(f64::from);
         // After rounding to `f32` the quaternion is not exactly of length 1.
-        let length = quaternion.iter().map(|c| c * c).sum::<f64>().sqrt();
-        let turn = Pose { position: [0.0; 3], quaternion_xyzw: quaternion.map(|c| c / length) };
-        let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| rotate(&turn, axis));
-        Turned { round, axes, at: pose.translation.to_array().map(f64::from) }
+        let axes = DMat3::from_quat(pose.rotation.as_dquat().normalize());
+        Turned { round, axes, at: pose.translation.as_dvec3() }
     }
 
-    fn rotate(&self, [x, y, z]: Point) -> Point {
-        let [a, b, c] = self.axes;
-        std::array::from_fn(|i| x * a[i] + y * b[i] + z * c[i])
+    fn rotate(&self, vector: Vector) -> Vector {
+        self.axes * vector
     }
 
     /// The support point of the core: the farthest along a direction.
-    fn farthest(&self, way: Point) -> Point {
-        let local = self.round.core.farthest(self.axes.map(|axis| dot(axis, way)));
-        sum(self.rotate(local), self.at)
+    fn farthest(&self, way: Vector) -> Vector {
+        self.rotate(self.round.core.farthest(self.axes.mul_transpose_vec3(way))) + self.at
     }
 
-    fn along(&self, way: Point) -> f64 {
-        dot(self.farthest(way), way) + self.round.radius
+    fn along(&self, way: Vector) -> f64 {
+        self.farthest(way).dot(way) + self.round.radius
     }
 }
 
@@ -329,19 +319,19 @@ fn between(a: &Round, b: &Turned, enough_m: f64) -> f64 {
 
 /// Distance of two cores: that of the origin from their Minkowski difference, all `p - q` with `p` in one and `q` in the other.
 fn cores_apart(a: &Core, b: &Turned, enough_m: f64) -> f64 {
-    let farthest = |way: Point| difference(a.farthest(way), b.farthest(way.map(|c| -c)));
+    let farthest = |way: Vector| a.farthest(way) - b.farthest(-way);
     let mut simplex = Simplex::default();
-    let mut nearest = farthest(if norm(b.at) > SAME_M { b.at } else { [1.0, 0.0, 0.0] });
+    let mut nearest = farthest(if b.at.length() > SAME_M { b.at } else { Vector::X });
     simplex.add(nearest);
     // Lower bound of the distance of the difference from the origin.
     let mut least: f64 = 0.0;
     for _ in 0..MAX_STEPS {
-        let far = norm(nearest);
+        let far = nearest.length();
         if far <= SAME_M {
             return 0.0;
         }
-        let corner = farthest(nearest.map(|c| -c));
-        least = least.max(dot(corner, nearest) / far);
+        let corner = farthest(-nearest);
+        least = least.max(corner.dot(nearest) / far);
         if least > enough_m || far - least <= ROUNDED_M + ROUNDED * far || simplex.has(&corner) {
             return least;
         }
@@ -350,7 +340,7 @@ fn cores_apart(a: &Core, b: &Turned, enough_m: f64) -> f64 {
         if simplex.count == 4 {
             return 0.0;
         }
-        if norm(nearest) >= far {
+        if nearest.length() >= far {
             return least;
         }
     }
@@ -360,34 +350,34 @@ fn cores_apart(a: &Core, b: &Turned, enough_m: f64) -> f64 {
 /// Up to four points whose hull approaches the origin.
 #[derive(Debug, Clone, Copy, Default)]
 struct Simplex {
-    corners: [Point; 4],
+    corners: [Vector; 4],
     count: usize,
 }
 
 impl Simplex {
-    fn corners(&self) -> &[Point] {
+    fn corners(&self) -> &[Vector] {
         &self.corners[..self.count]
     }
 
-    fn add(&mut self, corner: Point) {
+    fn add(&mut self, corner: Vector) {
         self.corners[self.count] = corner;
         self.count += 1;
     }
 
-    fn has(&self, corner: &Point) -> bool {
+    fn has(&self, corner: &Vector) -> bool {
         self.corners().contains(corner)
     }
 
     /// Returns the point of the hull that is nearest to the origin, and keeps only the corners of the smallest face that it is on; all four if the
     /// origin is inside.
-    fn reduce(&mut self) -> Point {
-        let (mut nearest, mut least, mut face) = ([0.0; 3], f64::INFINITY, 0);
+    fn reduce(&mut self) -> Vector {
+        let (mut nearest, mut least, mut face) = (Vector::ZERO, f64::INFINITY, 0);
         for chosen in 1..1_usize << self.count {
             let point = match nearest_on(&self.chosen(chosen)) {
                 Some(point) => point,
                 None => continue,
             };
-            let far = dot(point, point);
+            let far = point.length_squared();
             if far < least {
                 (nearest, least, face) = (point, far, chosen);
             }
@@ -405,47 +395,38 @@ impl Simplex {
 }
 
 /// The point of the plane through all corners that is nearest to the origin, if it is between them; the origin itself if it is inside of four.
-fn nearest_on(simplex: &Simplex) -> Option<Point> {
+fn nearest_on(simplex: &Simplex) -> Option<Vector> {
     let corners = simplex.corners();
     let first = *corners.first()?;
-    let edge = |i: usize| difference(corners[i], first);
-    let part = |u: f64, a: Point| a.map(|c| c * u);
+    let edge = |i: usize| corners[i] - first;
     match simplex.count {
         1 => Some(first),
         2 => {
             let a = edge(1);
-            let u = -dot(first, a) / dot(a, a);
-            (u > 0.0 && u < 1.0).then(|| sum(first, part(u, a)))
+            let u = -first.dot(a) / a.length_squared();
+            (u > 0.0 && u < 1.0).then(|| first + a * u)
         }
         3 => {
             let (a, b) = (edge(1), edge(2));
-            let normal = cross(a, b);
-            let square = dot(normal, normal);
+            let normal = a.cross(b);
+            let square = normal.length_squared();
             // Cramer's rule in the plane of the triangle.
-            let u = -dot(cross(first, b), normal) / square;
-            let v = dot(cross(first, a), normal) / square;
+            let u = -first.cross(b).dot(normal) / square;
+            let v = first.cross(a).dot(normal) / square;
             let is_between = u > 0.0 && v > 0.0 && u + v < 1.0;
-            is_between.then(|| part(dot(first, normal) / square, normal))
+            is_between.then(|| normal * (first.dot(normal) / square))
         }
         _ => {
             let (a, b, c) = (edge(1), edge(2), edge(3));
-            let volume = dot(a, cross(b, c));
-            if volume.abs() < FLAT * norm(a) * norm(b) * norm(c) {
+            let volume = a.dot(b.cross(c));
+            if volume.abs() < FLAT * a.length() * b.length() * c.length() {
                 return None;
             }
-            let share = |x: Point, y: Point| -dot(first, cross(x, y)) / volume;
+            let share = |x: Vector, y: Vector| -first.dot(x.cross(y)) / volume;
             let (u, v, w) = (share(b, c), share(c, a), share(a, b));
-            (u > 0.0 && v > 0.0 && w > 0.0 && u + v + w < 1.0).then_some([0.0; 3])
+            (u > 0.0 && v > 0.0 && w > 0.0 && u + v + w < 1.0).then_some(Vector::ZERO)
         }
     }
-}
-
-fn dot(a: Point, b: Point) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-fn sum(a: Point, b: Point) -> Point {
-    std::array::from_fn(|i| a[i] + b[i])
 }
 
 #[cfg(test)]

@@ -7,7 +7,6 @@
 use crate::along::first_breach;
 use crate::collision::between;
 use crate::constrained::{Constraint, LEAST_TOLERANCE};
-use crate::frame::norm;
 use crate::joint_vector::JointVector;
 use crate::mechanism::Mechanism;
 use crate::plan::PlanError;
@@ -16,6 +15,7 @@ use crate::robot_model::Joint;
 use crate::space::align;
 use crate::timing::{Section, Speed, timed_while};
 use crate::trajectory::Curve;
+use crate::vector::{Vector, rotate, unit};
 use ratn_model::pose::Pose;
 use std::f64::consts::{FRAC_PI_2, PI};
 
@@ -83,7 +83,8 @@ impl Keep {
         };
         if let Some(KeptAxis { axis, direction, tolerance_rad }) = self.axis {
             for (what, vector) in [("keep_axis", Some(axis)), ("keep_direction", direction)] {
-                if let Some(vector) = vector.filter(|v| !norm(*v).is_finite() || norm(*v) < LEAST_DIRECTION) {
+                let has_none = |length: f64| !length.is_finite() || length < LEAST_DIRECTION;
+                if let Some(vector) = vector.filter(|v| has_none(Vector::from(*v).length())) {
                     let expected = format!("finite numbers, and a length of more than {LEAST_DIRECTION}");
                     return malformed(what, format!("{vector:?}"), expected);
                 }
@@ -102,15 +103,14 @@ impl Keep {
         if *self == Keep::default() {
             return None;
         }
-        let unit = |v: [f64; 3]| v.map(|c| c / norm(v));
         let from_world = base.inverse();
         let mut target = Target { tolerance_m: [f64::INFINITY; 3], ..Target::upright(Pose::IDENTITY, f64::INFINITY) };
         let mut frame = Pose::IDENTITY;
         if let Some(KeptAxis { axis, direction, tolerance_rad }) = self.axis {
-            let axis = unit(axis);
-            let direction = direction.map_or_else(|| start.rotate(axis), |d| from_world.rotate(unit(d)));
-            frame = align(axis);
-            target.pose = align(unit(direction));
+            let axis = unit(axis.into());
+            let direction = direction.map_or_else(|| rotate(start, axis), |d| rotate(&from_world, unit(d.into())));
+            frame = align(axis.to_array());
+            target.pose = align(unit(direction).to_array());
             target.tolerance_rad = [tolerance_rad, tolerance_rad, PI];
         }
         if let Some(Region { pose, size }) = self.inside {

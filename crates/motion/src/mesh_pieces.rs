@@ -10,10 +10,10 @@
 //! The hull of a piece with many corners is made of the corners that are farthest along some hundred directions. It falls short of the whole hull
 //! by less than 1/200 of the distance from the middle of the piece to its border.
 
-use crate::frame::{cross, difference, norm};
 use crate::inside::Inside;
 use crate::surface::cut;
-use parry3d::math::Vector;
+use crate::vector::Vector;
+use parry3d::math::Vector as Vector32;
 use parry3d::shape::SharedShape;
 use parry3d::transformation::try_convex_hull;
 use std::f64::consts::PI;
@@ -53,7 +53,7 @@ pub struct ConvexPiece {
     /// Its corners.
     pub corners: Vec<Corner>,
     /// Outward normals of its faces, those with the same normal once. A flat piece has none.
-    pub(crate) normals: Vec<Corner>,
+    pub(crate) normals: Vec<Vector>,
     /// How far it stands out of the mesh, at the points that were compared, in metres.
     pub(crate) stands_out_m: f64,
 }
@@ -105,12 +105,11 @@ impl Whole<'_> {
             if self.inside.contains(at) {
                 continue;
             }
-            let [x, y, z] = at.map(|c| c as f32);
-            let nearest = self.shape.project_local_point(Vector::new(x, y, z), false).point;
-            let nearest = nearest.to_array().map(f64::from);
-            let far = norm(difference(at, nearest));
+            let at = Vector::from(at);
+            let nearest = self.shape.project_local_point(at.as_vec3(), false).point.as_dvec3();
+            let far = at.distance(nearest);
             if far > out_m {
-                (out_m, below) = (far, nearest);
+                (out_m, below) = (far, nearest.to_array());
             }
         }
         Piece { surface, hull, out_m, below }
@@ -149,11 +148,10 @@ impl Piece {
 impl Hull {
     fn of(surface: &[Polygon]) -> Hull {
         let corners = farthest(surface);
-        let points: Vec<Vector> =
-            corners.iter().map(|[x, y, z]| Vector::new(*x as f32, *y as f32, *z as f32)).collect();
+        let points: Vec<Vector32> = corners.iter().map(|corner| Vector::from(*corner).as_vec3()).collect();
         match try_convex_hull(&points) {
             Ok((points, faces)) if faces.len() > 3 => {
-                let corners: Vec<Corner> = points.iter().map(|point| point.to_array().map(f64::from)).collect();
+                let corners: Vec<Corner> = points.iter().map(|point| point.as_dvec3().to_array()).collect();
                 let faces = faces.iter().map(|face| face.map(|corner| corners[corner as usize])).collect();
                 Hull { corners, faces }
             }
@@ -162,13 +160,12 @@ impl Hull {
         }
     }
 
-    fn normals(&self) -> Vec<Corner> {
-        let mut normals: Vec<Corner> = Vec::new();
-        for [a, b, c] in &self.faces {
-            let across = cross(difference(*b, *a), difference(*c, *a));
-            let length = norm(across);
-            let normal = across.map(|c| c / length);
-            if length > 0.0 && normals.iter().all(|known| norm(difference(*known, normal)) > SAME_NORMAL) {
+    fn normals(&self) -> Vec<Vector> {
+        let mut normals: Vec<Vector> = Vec::new();
+        for face in &self.faces {
+            let [a, b, c] = face.map(Vector::from);
+            let Some(normal) = (b - a).cross(c - a).try_normalize() else { continue };
+            if normals.iter().all(|known| known.distance(normal) > SAME_NORMAL) {
                 normals.push(normal);
             }
         }
@@ -177,10 +174,9 @@ impl Hull {
 
     fn volume(&self) -> f64 {
         let Some([origin, ..]) = self.faces.first() else { return 0.0 };
-        let part = |[a, b, c]: &[Corner; 3]| {
-            let [a, b, c] = [a, b, c].map(|corner| difference(*corner, *origin));
-            let across = cross(a, b);
-            (0..3).map(|i| across[i] * c[i]).sum::<f64>() / 6.0
+        let part = |face: &[Corner; 3]| {
+            let [a, b, c] = face.map(|corner| Vector::from(corner) - Vector::from(*origin));
+            a.cross(b).dot(c) / 6.0
         };
         self.faces.iter().map(part).sum::<f64>().abs()
     }
@@ -205,11 +201,11 @@ fn farthest(surface: &[Polygon]) -> Vec<Corner> {
         let z = 1.0 - (2.0 * i as f64 + 1.0) / DIRECTIONS as f64;
         let (sin, cos) = (golden * i as f64).sin_cos();
         let aside = (1.0 - z * z).sqrt();
-        [aside * cos, aside * sin, z]
+        Vector::new(aside * cos, aside * sin, z)
     };
     let mut taken: Vec<usize> = Vec::with_capacity(DIRECTIONS);
     for way in (0..DIRECTIONS).map(direction) {
-        let along = |corner: &Corner| (0..3).map(|i| corner[i] * way[i]).sum::<f64>();
+        let along = |corner: &Corner| way.dot(Vector::from(*corner));
         let mut best = (f64::NEG_INFINITY, 0);
         for (i, corner) in all.iter().enumerate() {
             let far = along(corner);
@@ -241,8 +237,8 @@ fn thickened(corners: &[Corner]) -> Vec<Corner> {
 
 /// Sample points of a face, without its corners.
 fn places(face: &[Corner; 3]) -> Vec<Corner> {
-    let [a, b, c] = *face;
-    let longest = [[a, b], [b, c], [c, a]].iter().map(|[p, q]| norm(difference(*p, *q))).fold(0.0, f64::max);
+    let [a, b, c] = face.map(Vector::from);
+    let longest = [[a, b], [b, c], [c, a]].iter().map(|[p, q]| p.distance(*q)).fold(0.0, f64::max);
     // No point of a small face is farther than `CLOSE_M` from its corners, which are points of the mesh.
     if longest < CLOSE_M {
         return Vec::new();
@@ -252,7 +248,7 @@ fn places(face: &[Corner; 3]) -> Vec<Corner> {
     for i in 0..along {
         for j in 0..along - i {
             let [u, v] = [i, j].map(|k| (k as f64 + 1.0 / 3.0) / along as f64);
-            places.push(std::array::from_fn(|k| a[k] + u * (b[k] - a[k]) + v * (c[k] - a[k])));
+            places.push((a + u * (b - a) + v * (c - a)).to_array());
         }
     }
     places
@@ -321,15 +317,14 @@ mod tests {
         let shapes: Vec<SharedShape> = hulls
             .iter()
             .map(|hull| {
-                let points: Vec<Vector> =
-                    hull.corners.iter().map(|[x, y, z]| Vector::new(*x as f32, *y as f32, *z as f32)).collect();
+                let points: Vec<Vector32> = hull.corners.iter().map(|corner| Vector::from(*corner).as_vec3()).collect();
                 SharedShape::convex_hull(&points).unwrap()
             })
             .collect();
         for triangle in mesh.triangles() {
             let middle: Corner = std::array::from_fn(|i| triangle.iter().map(|corner| corner[i]).sum::<f64>() / 3.0);
-            let [x, y, z] = middle.map(|c| c as f32);
-            let near = shapes.iter().map(|shape| shape.distance_to_local_point(Vector::new(x, y, z), true));
+            let middle = Vector::from(middle);
+            let near = shapes.iter().map(|shape| shape.distance_to_local_point(middle.as_vec3(), true));
             assert!(near.fold(f32::INFINITY, f32::min) < 5e-4, "{middle:?}");
         }
     }

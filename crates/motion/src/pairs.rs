@@ -20,6 +20,7 @@ use crate::mechanism::Mechanism;
 use crate::robot_model::{Joint, RobotModel};
 use crate::robot_state::RobotState;
 use crate::spheres::Sphere;
+use crate::vector::Vector;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
@@ -275,5 +276,5 @@ pub(crate) fn spheres_meet(mechanism: &Mechanism, around: &[Sphere], poses: &[Po
 }
 
 fn away(a: [f64; 3], b: [f64; 3]) -> f64 {
-    (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f64>().sqrt()
+    Vector::from(a).distance(b.into())
 }

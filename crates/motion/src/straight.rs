@@ -2,8 +2,8 @@
 //!
 //! The tool keeps its rotation along the part. `line` computes the motion of the arm.
 
-use crate::frame::norm;
 use crate::plan::PlanError;
+use crate::vector::{Vector, unit};
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene};
 use std::fmt;
@@ -71,7 +71,7 @@ impl Straight {
     /// The vector from the beginning of the part to its end, in the frame of the base, whose pose is `base`; `tool` is in the base's frame, too.
     /// `None` for an object that is not in the scene.
     pub(crate) fn way(&self, scene: &Scene, base: &Pose, tool: &Pose) -> Option<[f64; 3]> {
-        let direction = self.direction.map(|c| c / norm(self.direction) * self.length_m);
+        let direction = (unit(self.direction.into()) * self.length_m).to_array();
         let from_world = base.inverse();
         Some(match &self.frame {
             Frame::World => from_world.rotate(direction),
@@ -93,7 +93,7 @@ impl Straight {
         if !(0.0..=MAX_STRAIGHT_M).contains(&self.length_m) {
             return malformed("m", self.length_m.to_string(), format!("0 to {MAX_STRAIGHT_M} m"));
         }
-        let length = norm(self.direction);
+        let length = Vector::from(self.direction).length();
         if !length.is_finite() || length < LEAST_DIRECTION {
             let expected = format!("a direction of finite numbers, longer than {LEAST_DIRECTION}");
             return malformed("direction", format!("{:?}", self.direction), expected);

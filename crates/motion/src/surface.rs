@@ -6,6 +6,7 @@
 //! triangles are cut off first, so that no ball is wasted on them.
 
 use crate::mesh::Mesh;
+use crate::vector::Vector;
 
 /// Approximate maximum number of balls on one mesh, in addition to one per triangle: a mesh that needs more gets larger balls.
 pub const MOST_SAMPLES: usize = 300_000;
@@ -105,31 +106,30 @@ fn side(radius: f64) -> f64 {
 
 /// The part of a triangle within bounds, in a frame of its plane with x along the triangle's longest side.
 struct Piece {
-    from: [f64; 3],
-    x: [f64; 3],
-    y: [f64; 3],
+    from: Vector,
+    x: Vector,
+    y: Vector,
     flat: Vec<[f64; 2]>,
 }
 
 impl Piece {
-    fn new(triangle @ [a, b, c]: &[[f64; 3]; 3], within: &Bounds) -> Option<Piece> {
+    fn new(triangle: &[[f64; 3]; 3], within: &Bounds) -> Option<Piece> {
         Bounds::about(triangle.iter().copied()).and(within)?;
-        let sides = [(a, b), (b, c), (c, a)];
-        let long = |(from, to): &(&[f64; 3], &[f64; 3])| length(&minus(to, from));
-        let (from, to) = sides.into_iter().max_by(|p, q| long(p).total_cmp(&long(q)))?;
-        let along = minus(to, from);
-        let reach = length(&along);
+        let [a, b, c] = triangle.map(Vector::from);
+        let long = |(from, to): &(Vector, Vector)| from.distance(*to);
+        let (from, to) = [(a, b), (b, c), (c, a)].into_iter().max_by(|p, q| long(p).total_cmp(&long(q)))?;
+        let reach = from.distance(to);
         if reach < 1e-12 {
-            return Some(Piece { from: *a, x: [0.0; 3], y: [0.0; 3], flat: vec![[0.0; 2]] });
+            return Some(Piece { from: a, x: Vector::ZERO, y: Vector::ZERO, flat: vec![[0.0; 2]] });
         }
-        let x = along.map(|c| c / reach);
-        let normal = cross(&minus(b, a), &minus(c, a));
-        let tall = length(&normal);
+        let x = (to - from) / reach;
+        let normal = (b - a).cross(c - a);
+        let tall = normal.length();
         // A triangle without area is a line: any perpendicular direction will do.
-        let y = if tall > 1e-18 { cross(&normal.map(|c| c / tall), &x) } else { [0.0; 3] };
-        let corners = within.cut(triangle);
-        let flat: Vec<[f64; 2]> = corners.iter().map(|p| minus(p, from)).map(|p| [dot(&p, &x), dot(&p, &y)]).collect();
-        (!flat.is_empty()).then_some(Piece { from: *from, x, y, flat })
+        let y = if tall > 1e-18 { (normal / tall).cross(x) } else { Vector::ZERO };
+        let corners = within.cut(triangle).into_iter().map(|corner| Vector::from(corner) - from);
+        let flat: Vec<[f64; 2]> = corners.map(|corner| [corner.dot(x), corner.dot(y)]).collect();
+        (!flat.is_empty()).then_some(Piece { from, x, y, flat })
     }
 
     /// The area and the longest extent.
@@ -145,11 +145,8 @@ impl Piece {
     fn cover(&self, side: f64, centres: &mut Vec<[f64; 3]>) {
         for column in slabs(&self.flat, 0, side) {
             for piece in slabs(&column, 1, side) {
-                let middle: [f64; 2] = std::array::from_fn(|i| {
-                    let [least, greatest] = range(&piece, i);
-                    (least + greatest) / 2.0
-                });
-                centres.push(std::array::from_fn(|i| self.from[i] + self.x[i] * middle[0] + self.y[i] * middle[1]));
+                let [u, v] = [0, 1].map(|axis| range(&piece, axis).iter().sum::<f64>() / 2.0);
+                centres.push((self.from + self.x * u + self.y * v).to_array());
             }
         }
     }
@@ -192,20 +189,4 @@ pub(crate) fn cut<const N: usize>(piece: &[[f64; N]], axis: usize, at: f64, side
 fn range(piece: &[[f64; 2]], axis: usize) -> [f64; 2] {
     let along = || piece.iter().map(|c| c[axis]);
     [along().fold(f64::INFINITY, f64::min), along().fold(f64::NEG_INFINITY, f64::max)]
-}
-
-fn minus(a: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
-    std::array::from_fn(|i| a[i] - b[i])
-}
-
-fn dot(a: &[f64; 3], b: &[f64; 3]) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-fn cross(a: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-}
-
-fn length(a: &[f64; 3]) -> f64 {
-    dot(a, a).sqrt()
 }

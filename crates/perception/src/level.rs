@@ -1,7 +1,7 @@
 //! Mean heights over a window around each pixel: noise falls with the window's side, so that flat objects can be separated from the surface.
 //! Heights clearly above or below are left out of a mean, because they would spread over their edges.
 
-use crate::vector::median;
+use crate::quantile::median;
 
 /// Side of the window, in pixels.
 pub(crate) const SIDE: usize = 3;

@@ -26,6 +26,7 @@ mod flying;
 mod level;
 mod normal;
 mod plane;
+mod quantile;
 mod rectangle;
 mod silhouette;
 mod vector;

@@ -10,8 +10,9 @@ use crate::flying::Heights;
 use crate::level;
 use crate::mask::{Ball, Mask};
 use crate::plane::Plane;
+use crate::quantile::median;
 use crate::silhouette::{self, Sight};
-use crate::vector::{Vector, cross, dot, length, median, scale, sub};
+use crate::vector::{Vector, cross, dot, length, scale, sub};
 use ratn_model::pose::Pose;
 
 /// Maximum height of the surface above or below its given pose, in metres.

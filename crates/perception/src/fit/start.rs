@@ -2,8 +2,9 @@
 
 use super::Fit;
 use crate::model::ObjectClass;
+use crate::quantile::{median, quantile};
 use crate::rectangle;
-use crate::vector::{Vector, median, quantile};
+use crate::vector::Vector;
 use std::f64::consts::PI;
 
 /// Summary of a cluster, in metres.

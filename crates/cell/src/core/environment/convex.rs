@@ -2,7 +2,7 @@
 //!
 //! All numbers are `f64` and in the world frame. The shapes are read from the bodies that the physics engine moves.
 
-use super::vector::Vector;
+use super::vector::{Vector, direction};
 use rapier3d::math::{Pose as Pose32, Vector as Vector32};
 use rapier3d::parry::shape::Shape;
 use ratn_model::pose::Pose;
@@ -44,7 +44,7 @@ impl Convex {
         // After rounding to `f32` the quaternion is not exactly of length 1.
         let length = (x * x + y * y + z * z + w * w).sqrt();
         let turn = Pose { position: [0.0; 3], quaternion_xyzw: [x, y, z, w].map(|c| c / length) };
-        let turned = |Vector(v): Vector| Vector(turn.rotate(v));
+        let turned = |v: Vector| Vector::from(turn.rotate(v.to_array()));
         let (at, axes) = (wide(place.translation), Vector::AXES.map(turned));
         let placed = |middle: Vector, core: Core, radius: f64| Some(Convex { middle, core, radius });
         if let Some(ball) = shape.as_ball() {
@@ -55,7 +55,7 @@ impl Convex {
             return placed(at + (a + b) * 0.5, Core::Line((b - a) * 0.5), f64::from(capsule.radius));
         }
         if let Some(cuboid) = shape.as_cuboid() {
-            let Vector(half) = wide(cuboid.half_extents);
+            let half = wide(cuboid.half_extents);
             return placed(at, Core::Box(std::array::from_fn(|i| axes[i] * half[i])), 0.0);
         }
         let cylinder = shape.as_cylinder()?;
@@ -96,7 +96,9 @@ impl Convex {
         match self.core {
             Core::Point => Vec::new(),
             // A line has no face; but the common points of two lines are in planes that contain one of them.
-            Core::Line(half) => half.direction().into_iter().flat_map(Vector::across).collect(),
+            Core::Line(half) => {
+                direction(half).into_iter().flat_map(|way| <[Vector; 2]>::from(way.any_orthonormal_pair())).collect()
+            }
             Core::Triangle([a, b, c]) => vec![(b - a).cross(c - b)],
             Core::Box(half) => half.to_vec(),
             Core::Cylinder { axis, .. } => vec![axis],
@@ -126,7 +128,7 @@ impl Convex {
                 (0..8).map(|bits| (0..3).map(|i| signed(bits, i)).sum()).collect()
             }
             Core::Cylinder { axis, radius, half_length } => {
-                let out = outward(way, axis).unwrap_or(axis.across()[0]);
+                let out = outward(way, axis).unwrap_or(axis.any_orthonormal_vector());
                 let aside = axis.cross(out);
                 let rim = (0..ROUND).map(|i| (TAU * f64::from(i) / f64::from(ROUND)).sin_cos());
                 let round = rim.map(|(sin, cos)| out * (radius * cos) + aside * (radius * sin));
@@ -142,9 +144,9 @@ impl Convex {
 /// The unit vector perpendicular to an axis that is nearest to `way`; `None` if `way` is along the axis.
 fn outward(way: Vector, axis: Vector) -> Option<Vector> {
     // If the direction is nearly along the axis, normalising amplifies the rounding error along it, so that part is removed again.
-    way.beside(axis).direction().map(|out| out.beside(axis))
+    direction(way.reject_from_normalized(axis)).map(|out| out.reject_from_normalized(axis))
 }
 
 fn wide(v: Vector32) -> Vector {
-    Vector(v.to_array().map(f64::from))
+    v.as_dvec3()
 }

@@ -14,7 +14,7 @@
 
 use super::convex::Convex;
 use super::polygon::Polygon;
-use super::vector::Vector;
+use super::vector::{Vector, direction};
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
@@ -116,12 +116,12 @@ impl Pair<'_> {
         let (faces, others) = (self.a.across(), self.b.across());
         let (edges, its) = (self.a.edges(), self.b.edges());
         let between = self.b.middle - self.a.middle;
-        let aside = |line: &Vector| Some(between.beside(line.direction()?));
+        let aside = |line: &Vector| Some(between.reject_from_normalized(direction(*line)?));
         let aside: Vec<Vector> = edges.iter().chain(&its).filter_map(aside).collect();
         let crossing =
             edges.into_iter().flat_map(move |edge| its.clone().into_iter().map(move |other| edge.cross(other)));
         let guesses = [between].into_iter().chain(faces).chain(others).chain(crossing).chain(aside);
-        guesses.filter_map(Vector::direction).flat_map(|way| [way, -way])
+        guesses.filter_map(direction).flat_map(|way| [way, -way])
     }
 
     /// The direction along which the cores overlap least; `None` if that is less than `farthest`.
@@ -163,7 +163,7 @@ impl Triangle {
         let value = value(&corners.map(|row| corners.map(|column| row.way.dot(column.point))));
         let [a, b, c] = corners.map(|corner| corner.way);
         // The weights of a direction between the corners add up to one at a corner, and to no more than `most()` anywhere.
-        let most = || (b - a).cross(c - a).direction().map_or(f64::INFINITY, |across| 1.0 / across.dot(a).abs());
+        let most = || direction((b - a).cross(c - a)).map_or(f64::INFINITY, |across| 1.0 / across.dot(a).abs());
         Triangle { corners, bound: if value < 0.0 { value * most() } else { value } }
     }
 
@@ -176,7 +176,7 @@ impl Triangle {
     fn middle_of_longest(&self) -> Vector {
         let i = self.longest();
         let middle = self.corners[i].way + self.corners[(i + 1) % 3].way;
-        middle.direction().unwrap_or(self.corners[i].way)
+        direction(middle).unwrap_or(self.corners[i].way)
     }
 
     fn halves(&self, middle: Corner) -> [Triangle; 2] {
@@ -188,7 +188,7 @@ impl Triangle {
     /// The normal of the plane through its points, on the triangle's side: the normal of a face if the points are on one.
     fn across(&self) -> Option<Vector> {
         let [a, b, c] = self.corners.map(|corner| corner.point);
-        let way = (b - a).cross(c - a).direction()?;
+        let way = direction((b - a).cross(c - a))?;
         Some(if way.dot(self.corners[0].way) < 0.0 { -way } else { way })
     }
 }
@@ -244,15 +244,15 @@ fn value(payoffs: &[[f64; 3]; 3]) -> f64 {
         }
     }
     // The mixture for which all three rows give the same.
-    let [a, b, c] = payoffs.map(Vector);
+    let [a, b, c] = payoffs.map(Vector::from);
     let weights = (a - b).cross(a - c);
-    let shares = weights.0.map(|weight| weight / weights.0.iter().sum::<f64>());
+    let shares = (weights / weights.element_sum()).to_array();
     if shares.iter().all(|share| *share >= 0.0) { best.max(sure(shares)) } else { best }
 }
 
 /// A point between two shapes that separate along a direction: in both contact faces, seen along it, or between their nearest points.
 fn place(a: &Convex, b: &Convex, way: Vector) -> Vector {
-    let [x, y] = way.across();
+    let (x, y) = way.any_orthonormal_pair();
     let at = across(a, b, way, FACE_M);
     let along = a.farthest(way).dot(way) + a.radius + b.farthest(-way).dot(way) - b.radius;
     (x * (at[0][0] + at[1][0]) + y * (at[0][1] + at[1][1]) + way * along) * 0.5
@@ -260,7 +260,7 @@ fn place(a: &Convex, b: &Convex, way: Vector) -> Vector {
 
 /// A point of each of the two contact faces, seen along a direction, near to each other; corners up to `within_m` behind count as on the face.
 fn across(a: &Convex, b: &Convex, way: Vector, within_m: f64) -> [[f64; 2]; 2] {
-    let [x, y] = way.across();
+    let (x, y) = way.any_orthonormal_pair();
     let seen = |face: Vec<Vector>| Polygon::around(face.iter().map(|p| [p.dot(x), p.dot(y)]).collect());
     let [mine, its] = [a.face(way, within_m), b.face(-way, within_m)].map(seen);
     let mut at = [mine.middle(); 2];
@@ -420,7 +420,7 @@ mod tests {
             for _ in 0..2000 {
                 let beside = other.nearest(best);
                 let next = self.nearest(beside);
-                let is_there = (Vector(next) - Vector(best)).length() < 1e-10;
+                let is_there = (Vector::from(next) - Vector::from(best)).length() < 1e-10;
                 best = next;
                 if is_there {
                     break;
@@ -449,8 +449,8 @@ mod tests {
 
     fn direction(random: &mut impl Rng) -> [f64; 3] {
         loop {
-            let way = Vector(std::array::from_fn(|_| random.random_range(-1.0..1.0)));
-            if let Some(Vector(way)) = way.direction().filter(|_| way.length() < 1.0) {
+            let way = Vector::from(std::array::from_fn(|_| random.random_range(-1.0..1.0)));
+            if let Some(way) = super::direction(way).map(|way| way.to_array()).filter(|_| way.length() < 1.0) {
                 return way;
             }
         }
@@ -463,7 +463,7 @@ mod tests {
         // Most pairs hardly touch.
         let apart = a.least(&b, f64::NEG_INFINITY, random);
         if apart > 0.0 && random.random_range(0..4) > 0 {
-            let Meeting { normal: Vector(way), .. } = meeting(&a.convex(), &b.convex(), f64::INFINITY).unwrap();
+            let way = meeting(&a.convex(), &b.convex(), f64::INFINITY).unwrap().normal.to_array();
             let wanted = *[1e-2, 1e-3, 2e-4, -2e-4, -1e-3, -1e-2].get(random.random_range(0..6)).unwrap();
             b = b.moved(away(way, wanted - apart));
         }
@@ -479,8 +479,8 @@ mod tests {
         for _ in 0..PAIRS {
             let [a, b] = pair(&mut random);
             let found = meeting(&a.convex(), &b.convex(), f64::INFINITY).unwrap();
-            let Vector(normal) = found.normal;
-            let off = [&a, &b].map(|thing| thing.distance(found.at.0) - found.depth_m.abs() / 2.0);
+            let normal = found.normal.to_array();
+            let off = [&a, &b].map(|thing| thing.distance(found.at.to_array()) - found.depth_m.abs() / 2.0);
             assert!(off.iter().all(|off| *off < 1e-2), "{found:?} is beside: {off:?} {a:?} {b:?}");
             // Moved by the depth that was found, the shapes are just free of each other.
             let freed = a.least(&b.moved(away(normal, found.depth_m + OFF_M)), f64::NEG_INFINITY, &mut random);

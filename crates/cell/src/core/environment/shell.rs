@@ -7,7 +7,7 @@
 
 use super::convex::Convex;
 use super::overlap::{Meeting, meeting};
-use super::vector::Vector;
+use super::vector::{Vector, direction};
 use rapier3d::math::Vector as Vector32;
 use rapier3d::parry::bounding_volume::{Aabb, BoundingVolume};
 use rapier3d::parry::partitioning::{Bvh, BvhBuildStrategy};
@@ -41,7 +41,7 @@ pub(super) struct Surface {
 
 impl Surface {
     pub(super) fn of(meshed: &Meshed) -> Surface {
-        let corner = |corner: &[f64; 3]| Vector(meshed.pose.transform(*corner));
+        let corner = |corner: &[f64; 3]| Vector::from(meshed.pose.transform(*corner));
         let point = |at: &[f64; 3]| narrow(corner(at));
         let hull = |piece: &ConvexPiece| SharedShape::convex_hull(&piece.corners.iter().map(point).collect::<Vec<_>>());
         let hulls = meshed.mesh.pieces().hulls.iter().filter_map(hull).collect();
@@ -62,7 +62,7 @@ impl Surface {
     }
 
     fn triangle(&self, index: u32, at: &Pose) -> Convex {
-        Convex::triangle(self.triangles[index as usize].map(|Vector(corner)| Vector(at.transform(corner))))
+        Convex::triangle(self.triangles[index as usize].map(|corner| Vector::from(at.transform(corner.to_array()))))
     }
 
     /// Its contact with a convex shape, if they are no farther apart than `within_m` metres. A negative `within_m` is a minimum depth.
@@ -72,8 +72,8 @@ impl Surface {
 
     fn meeting_near(&self, at: Pose, other: &Convex, within_m: f64) -> Option<Meeting> {
         let found = self.nearest_triangle(at, other, within_m, &mut { MAX_PAIRS });
-        let Vector(middle) = other.middle;
-        let seen = Vector(at.inverse().transform(middle));
+        let middle = other.middle.to_array();
+        let seen = Vector::from(at.inverse().transform(middle));
         if found.is_some_and(|found| found.depth_m >= 0.0) || !self.tree.root_aabb().contains_local_point(narrow(seen))
         {
             return found;
@@ -87,8 +87,7 @@ impl Surface {
     /// be deeper than the deepest one found.
     fn nearest_triangle(&self, at: Pose, other: &Convex, within_m: f64, pairs: &mut usize) -> Option<Meeting> {
         let near = extent(other, &at, within_m.max(0.0));
-        let ways: Vec<Vector> =
-            other.across().into_iter().filter_map(Vector::direction).flat_map(|way| [way, -way]).collect();
+        let ways: Vec<Vector> = other.across().into_iter().filter_map(direction).flat_map(|way| [way, -way]).collect();
         let mut open: Vec<(f64, Convex)> = Vec::new();
         let bounds: Vec<_> = ways.iter().map(|way| bound_along(*way, &at, other, within_m)).collect();
         for index in self.tree.leaves(|node| node.aabb().intersects(&near) && reaches(&node.aabb(), &bounds)) {
@@ -166,8 +165,9 @@ impl Surface {
             return None;
         }
         let from_there = its.inverse().compose(at);
-        let seen =
-            |index: u32| self.triangles[index as usize].map(|Vector(corner)| Vector(from_there.transform(corner)));
+        let seen = |index: u32| {
+            self.triangles[index as usize].map(|corner| Vector::from(from_there.transform(corner.to_array())))
+        };
         let room = other.tree.root_aabb();
         let near = moved(&room, &from_there.inverse());
         let corners = self.tree.intersect_aabb(&near).flat_map(seen);
@@ -185,11 +185,11 @@ impl Surface {
             |index, _| Some((nearest(&self.triangles[index as usize], point) - point).length() as f32),
         );
         let nearest = near.map_or(point, |(index, _)| nearest(&self.triangles[index as usize], point));
-        let inwards = (point - nearest).direction().unwrap_or(Vector::AXES[2]);
+        let inwards = direction(point - nearest).unwrap_or(Vector::AXES[2]);
         Meeting {
             depth_m: (point - nearest).length(),
-            normal: Vector(at.rotate(inwards.0)),
-            at: Vector(at.transform(point.0)),
+            normal: Vector::from(at.rotate(inwards.to_array())),
+            at: Vector::from(at.transform(point.to_array())),
         }
     }
 
@@ -203,18 +203,18 @@ impl Surface {
 }
 
 /// Whether a ray upwards from a point crosses a triangle: 1 from below, -1 from above. A ray along a common edge crosses one of two triangles.
-fn crossed(triangle: &[Vector; 3], Vector([x, y, z]): Vector) -> i32 {
-    let edges = [[0, 1], [1, 2], [2, 0]].map(|edge| edge.map(|corner: usize| triangle[corner].0));
+fn crossed(triangle: &[Vector; 3], Vector { x, y, z }: Vector) -> i32 {
+    let edges = [[0, 1], [1, 2], [2, 0]].map(|edge| edge.map(|corner: usize| triangle[corner]));
     // An edge counts if exactly one of its ends is beyond y.
-    let beyond = |[a, b]: &[[f64; 3]; 2]| {
+    let beyond = |[a, b]: &[Vector; 2]| {
         let (a, b) = if a[1] <= b[1] { (a, b) } else { (b, a) };
         a[1] <= y && y < b[1] && x < a[0] + (b[0] - a[0]) * ((y - a[1]) / (b[1] - a[1]))
     };
     if edges.iter().filter(|edge| beyond(edge)).count() != 1 {
         return 0;
     }
-    let across = (triangle[1] - triangle[0]).cross(triangle[2] - triangle[0]).0;
-    let Vector([a, b, c]) = triangle[0];
+    let across = (triangle[1] - triangle[0]).cross(triangle[2] - triangle[0]);
+    let Vector { x: a, y: b, z: c } = triangle[0];
     // The height of the triangle's plane there.
     let height = c - (across[0] * (x - a) + across[1] * (y - b)) / across[2];
     if across[2] == 0.0 || height < z { 0 } else { across[2].signum() as i32 }
@@ -222,7 +222,7 @@ fn crossed(triangle: &[Vector; 3], Vector([x, y, z]): Vector) -> i32 {
 
 /// Upper bound of the depth of two shapes: their overlap along any of these directions, or from middle to middle.
 fn deepest_along(ways: &[Vector], a: &Convex, b: &Convex) -> f64 {
-    let between = (b.middle - a.middle).direction();
+    let between = direction(b.middle - a.middle);
     let overlap = |way: &Vector| (a.farthest(*way) - b.farthest(-*way)).dot(*way) + a.radius + b.radius;
     ways.iter().chain(&between).map(overlap).fold(f64::INFINITY, f64::min)
 }
@@ -230,8 +230,8 @@ fn deepest_along(ways: &[Vector], a: &Convex, b: &Convex) -> f64 {
 /// A direction in the frame of a mesh, and what is to be added to how far a part of the mesh reaches along it: if the sum is negative, the part is
 /// farther from the shape than `within_m` metres.
 fn bound_along(way: Vector, at: &Pose, other: &Convex, within_m: f64) -> (Vector32, f64) {
-    let beyond = (Vector(at.position) - other.farthest(-way)).dot(way) + other.radius + within_m + ROUNDED_M;
-    (narrow(Vector(at.inverse().rotate(way.0))), beyond)
+    let beyond = (Vector::from(at.position) - other.farthest(-way)).dot(way) + other.radius + within_m + ROUNDED_M;
+    (narrow(Vector::from(at.inverse().rotate(way.to_array()))), beyond)
 }
 
 /// Whether a box of the tree is near the shape along each of these directions.
@@ -244,8 +244,8 @@ fn deeper(a: Meeting, b: Meeting) -> Meeting {
     if b.depth_m > a.depth_m { b } else { a }
 }
 
-fn narrow(Vector(v): Vector) -> Vector32 {
-    Vector32::from_array(v.map(|c| c as f32))
+fn narrow(v: Vector) -> Vector32 {
+    v.as_vec3()
 }
 
 /// The bounding box of points, `more_m` metres larger.
@@ -261,11 +261,11 @@ fn moved(aabb: &Aabb, pose: &Pose) -> Aabb {
 /// The bounding box of a convex shape in a frame, `more_m` metres larger.
 fn extent(convex: &Convex, frame: &Pose, more_m: f64) -> Aabb {
     let reach = |way: Vector| {
-        let along = Vector(frame.rotate(way.0));
-        (convex.farthest(along) - Vector(frame.position)).dot(along) + convex.radius
+        let along = Vector::from(frame.rotate(way.to_array()));
+        (convex.farthest(along) - Vector::from(frame.position)).dot(along) + convex.radius
     };
-    let most = Vector(Vector::AXES.map(reach));
-    let least = Vector(Vector::AXES.map(|axis| -reach(-axis)));
+    let most = Vector::from(Vector::AXES.map(reach));
+    let least = Vector::from(Vector::AXES.map(|axis| -reach(-axis)));
     around(&[least, most], more_m)
 }
 
@@ -273,7 +273,7 @@ fn extent(convex: &Convex, frame: &Pose, more_m: f64) -> Aabb {
 fn nearest(triangle: &[Vector; 3], to: Vector) -> Vector {
     let [a, b, c] = *triangle;
     let edges = [[a, b], [b, c], [c, a]];
-    if let Some(across) = (b - a).cross(c - a).direction() {
+    if let Some(across) = direction((b - a).cross(c - a)) {
         let on_plane = to - across * (to - a).dot(across);
         if edges.iter().all(|[from, end]| (*end - *from).cross(on_plane - *from).dot(across) >= 0.0) {
             return on_plane;

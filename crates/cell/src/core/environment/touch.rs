@@ -518,7 +518,7 @@ fn candidates_of<'g, 'a>(
 /// Depth of a thing in the support below it; `None` if the support does not bear it.
 fn bears(below: &Part<'_>, above: &Part<'_>) -> Option<f64> {
     let met = below.form.meeting(&above.form, TOUCH_M)?;
-    (met.normal.0[2] >= LEVEL).then_some(met.depth_m)
+    (met.normal.z >= LEVEL).then_some(met.depth_m)
 }
 
 /// The contact of two parts, if they are no farther apart than `within_m` metres. A negative `within_m` is a minimum depth.
@@ -528,13 +528,13 @@ fn touch(a: &Part<'_>, b: &Part<'_>, within_m: f64) -> Option<Touch> {
 
 /// The contact of two bodies that meet so, with these velocities.
 fn touched(met: &Meeting, speeds: [Speed; 2]) -> Touch {
-    let at = Vector::from_array(met.at.0.map(|c| c as f32));
+    let at = met.at.as_vec3();
     let [va, vb] = speeds.map(|speed| speed.at(at));
     Touch {
         things: [Thing::Object(0), Thing::Object(0)],
         depth_m: met.depth_m,
-        at: met.at.0,
-        normal: met.normal.0,
+        at: met.at.to_array(),
+        normal: met.normal.to_array(),
         speed_m_s: f64::from((va - vb).length()),
     }
 }
