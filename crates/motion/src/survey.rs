@@ -8,6 +8,7 @@ use crate::joint_vector::JointVector;
 use crate::pairs::{self, Pair};
 use crate::plan::has_room;
 use crate::reach::Target;
+use crate::request::unit;
 use crate::robot::{Configuration, Joint, Robot};
 use crate::robot_model::RobotModel;
 use crate::top_grasp::{APPROACH_M, grasp_poses};
@@ -120,6 +121,15 @@ impl Survey {
             ),
             format!("gripper   {opening}"),
         ]);
+        let limits = |(joint, slides): (&Joint, &bool)| {
+            let (unit, range) = (unit(*slides), format!("{:.3} to {:.3}", joint.lower, joint.upper));
+            let range = if joint.endless { "turns without end".to_owned() } else { format!("{range} {unit}") };
+            let Joint { name, velocity, acceleration, jerk, .. } = joint;
+            format!(
+                "limits    {name}: {range}; {velocity:.3} {unit}/s, {acceleration:.3} {unit}/s², {jerk:.3} {unit}/s³"
+            )
+        };
+        self.lines.extend(robot.arm_joints().iter().zip(robot.arm_slides()).map(limits));
     }
 
     /// Adds the pairs of links that are not checked although no SRDF excepts them, those that the search does not check, and those that block every motion.

@@ -42,6 +42,7 @@ fn what_the_arm_holds_moves_with_it_and_what_another_one_holds_is_where_that_one
 #[test]
 fn each_arm_of_the_twin_reaches_its_own_boxes_and_places() {
     let lines = survey(&Robot::built_in("twin").unwrap()).lines;
+    assert!(lines.iter().any(|said| said.starts_with("limits    ") && said.contains("rad/s²")), "{lines:#?}");
     for line in ["boxes     5 of 5", "places    3 of 3", "boxes     `right`: 5 of 5", "places    `right`: 3 of 3"] {
         assert!(lines.iter().any(|said| said.starts_with(line)), "{line}: {lines:#?}");
     }

@@ -277,7 +277,7 @@ impl Setup<'_> {
         let system = starting(Box::pin(System::start_private(config, tls)), interrupt).await?;
         let (ended, judgement) =
             on_system(run, system, Beside::default(), interrupt, async |system| system.judgement().await).await?;
-        let Judgement { delivered, greatest_tilt_rad, unintended_contacts } = judgement;
+        let Judgement { delivered, greatest_tilt_rad, unintended_contacts, waited_share } = judgement;
         let timeline = Timeline::of(&log::read(&log_file)?.lines);
         if timeline.outcome.as_deref() != Some(ended.outcome.as_str()) {
             bail!("the event log {} does not end as the run did", log_file.display());
@@ -289,7 +289,17 @@ impl Setup<'_> {
         };
         let chart = directory.join(format!("{}.html", plan.file_stem()));
         let plan = *plan;
-        Ok(Outcome { plan, timeline, delivered, greatest_tilt_rad, unintended_contacts, end, log: log_file, chart })
+        Ok(Outcome {
+            plan,
+            timeline,
+            delivered,
+            greatest_tilt_rad,
+            unintended_contacts,
+            waited_share,
+            end,
+            log: log_file,
+            chart,
+        })
     }
 }
 

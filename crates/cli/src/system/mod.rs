@@ -17,6 +17,7 @@ use crashes::Crashes;
 use launch::Processes;
 use nix::unistd::{AccessFlags, access};
 use ratn_daemon::config::{Durability, state_directory};
+use ratn_daemon::processor_demand;
 use ratn_model::resource::Quantity;
 use ratn_proto::types::PoolStatus;
 use ratn_proto::v1::cell_service_client::CellServiceClient;
@@ -56,6 +57,8 @@ pub(crate) struct Judgement {
     pub(crate) greatest_tilt_rad: f64,
     /// Unintended contacts.
     pub(crate) unintended_contacts: Vec<UnintendedContact>,
+    /// The share of the processor time that the system asked for in which it had none, because others had the processors; from 0 to 1.
+    pub(crate) waited_share: f64,
 }
 
 /// The roles of a system on one machine, in the order of starting; the cell only where the robot has a workplace in it.
@@ -216,6 +219,7 @@ impl System {
             delivered: truth.objects.iter().filter(|one| one.in_place && !one.held).count(),
             greatest_tilt_rad: upright.map(|one| one.greatest_tilt_rad).fold(0.0, f64::max),
             unintended_contacts: truth.unintended_contacts,
+            waited_share: processor_demand::of_tree(std::process::id()).waited_share(),
         })
     }
 

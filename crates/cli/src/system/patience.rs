@@ -70,7 +70,8 @@ impl Patience {
 pub(super) fn processor_time(of: &[u32], parents: &[u32]) -> BTreeMap<u32, Duration> {
     let entries = std::fs::read_dir("/proc").into_iter().flatten().flatten();
     let pids = entries.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
-    let all: BTreeMap<u32, (Duration, u32)> = pids.filter_map(|pid| Some((pid, of_process(pid)?))).collect();
+    let all: BTreeMap<u32, (Duration, u32)> =
+        pids.filter_map(|pid| of_process(pid).map(|(demand, parent)| (pid, (demand.total(), parent)))).collect();
     let is_below = |pid: u32| {
         // The chain of parents is bounded by the number of processes.
         let above = std::iter::successors(Some(pid), |pid| all.get(pid).map(|(_, parent)| *parent));

@@ -470,7 +470,7 @@ async fn tell_busy(
     let mut told = Duration::ZERO;
     loop {
         tokio::time::sleep(within / 10).await;
-        let asked_for = of_tree(pid);
+        let asked_for = of_tree(pid).total();
         // A descendant that has ended counts no more.
         told = told.min(asked_for);
         if asked_for - told >= within / 30 {

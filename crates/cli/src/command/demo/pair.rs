@@ -9,8 +9,8 @@ use crate::command::{blocking_here, check};
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
 use crate::output;
-use crate::system::System;
 use crate::system::config::SystemConfig;
+use crate::system::{Judgement, System};
 use anyhow::{Context, anyhow};
 use ratn_cell::config::Setting;
 use ratn_event_log as log;
@@ -62,6 +62,8 @@ struct Outcome {
     makespan_s: f64,
     delivered: usize,
     unintended_contacts: Vec<UnintendedContact>,
+    /// The share of its processor time that the system waited for, from 0 to 1.
+    waited_share: f64,
 }
 
 /// Everything that is shown.
@@ -191,8 +193,8 @@ impl Setup<'_> {
             Way::InTurn => left.ended.makespan_s + right.ended.makespan_s,
             Way::Together => passed_s,
         };
-        let (delivered, unintended_contacts) = (judgement.delivered, judgement.unintended_contacts);
-        Ok(Outcome { way, runs: vec![left, right], makespan_s, delivered, unintended_contacts })
+        let Judgement { delivered, unintended_contacts, waited_share, .. } = judgement;
+        Ok(Outcome { way, runs: vec![left, right], makespan_s, delivered, unintended_contacts, waited_share })
     }
 
     /// The run of one arm's task.
@@ -360,6 +362,7 @@ impl fmt::Display for Demonstration {
             f,
             "  (planning: while the arm did not move and nothing was looked at; idle: waiting for the middle, among others)"
         )?;
+        f.write_str(&super::result::busy(self.outcomes.iter().map(|outcome| outcome.waited_share)))?;
         writeln!(f, "\nfiles")?;
         for run in self.outcomes.iter().flat_map(|outcome| &outcome.runs) {
             writeln!(f, "  {}", run.log.display())?;
@@ -390,7 +393,7 @@ mod tests {
             chart: PathBuf::new(),
         };
         let runs = ARMS.into_iter().zip(ends).map(run).collect();
-        Outcome { way, runs, makespan_s, delivered: 6, unintended_contacts: Vec::new() }
+        Outcome { way, runs, makespan_s, delivered: 6, unintended_contacts: Vec::new(), waited_share: 0.0 }
     }
 
     fn demonstration(outcomes: Vec<Outcome>) -> Demonstration {

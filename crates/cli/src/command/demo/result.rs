@@ -22,6 +22,9 @@ const PAPER: [(Goods, f64, Option<f64>, f64); 5] = [
     (Goods::Dishes { bowls: 3, forks: 3, cups: 0, plates: 0 }, 255.4, None, 207.2),
 ];
 
+/// Share of its processor time that a system waits for on a busy machine.
+const BUSY: f64 = 0.3;
+
 /// The row of the task with overlapping motions and looks.
 const OVERLAPPED: Work = Work::Overlapped { plan_s: 0.0 };
 
@@ -69,6 +72,8 @@ pub(super) struct Outcome {
     pub(super) greatest_tilt_rad: f64,
     /// Unintended contacts, according to the cell's physics.
     pub(super) unintended_contacts: Vec<UnintendedContact>,
+    /// The share of its processor time that the system waited for, from 0 to 1.
+    pub(super) waited_share: f64,
     /// How the task ended, as a sentence.
     pub(super) end: String,
     pub(super) log: PathBuf,
@@ -409,6 +414,7 @@ impl fmt::Display for Demonstration {
         self.write_sweep(f)?;
         self.write_where_the_time_went(f)?;
         self.write_plans(f)?;
+        f.write_str(&busy(self.outcomes.iter().map(|outcome| outcome.waited_share)))?;
         writeln!(f, "\nfiles")?;
         for outcome in &self.outcomes {
             writeln!(f, "  {:<26} {}", outcome.plan.name(), outcome.log.display())?;
@@ -477,6 +483,18 @@ impl Demonstration {
     }
 }
 
+/// A warning about figures that were measured on a busy machine; empty on one that was not. The shares are of the runs.
+pub(super) fn busy(waited_shares: impl Iterator<Item = f64>) -> String {
+    match waited_shares.fold(0.0, f64::max) {
+        share if share > BUSY => format!(
+            "\nWARNING: the processors were busy: up to {:.0} % of the time in which the system wanted to compute it had to wait for one. Plans took \
+             longer for that, so these figures are not those of an idle machine.\n",
+            share * 100.0
+        ),
+        _ => String::new(),
+    }
+}
+
 fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     let mut values: Vec<f64> = values.collect();
     values.sort_by(f64::total_cmp);
@@ -497,10 +515,17 @@ mod tests {
             delivered: 1,
             greatest_tilt_rad: 0.0,
             unintended_contacts: Vec::new(),
+            waited_share: 0.0,
             end: String::new(),
             log: PathBuf::new(),
             chart: PathBuf::new(),
         }
+    }
+
+    #[test]
+    fn figures_of_a_busy_machine_are_shown_with_a_warning() {
+        assert_eq!(busy([0.0, 0.1].into_iter()), "");
+        assert!(busy([0.1, 0.62].into_iter()).contains("up to 62 %"));
     }
 
     #[test]
