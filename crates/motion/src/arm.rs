@@ -16,7 +16,7 @@ use crate::space::{Obstacle, Space, State};
 use crate::spheres::cover_within;
 use crate::surroundings::Surroundings;
 use ratn_model::pose::Pose;
-use ratn_world::scene::{Placement, Scene, Shape};
+use ratn_world::scene::{Placement, Scene};
 use std::collections::BTreeSet;
 
 /// Maximum distance by which the spheres stand out of a shape, in metres, unless the shape is very long.
@@ -152,21 +152,18 @@ pub fn on_floor(robot: &Robot, base: &Pose) -> Pose {
 /// Position of each finger around the held object, or open, in metres from the middle.
 fn finger_around_held(robot: &Robot, scene: &Scene) -> f64 {
     let open = robot.open_finger_m();
-    let widths = scene.objects.iter().filter_map(|object| match (&object.placement, &object.shape) {
-        (Placement::Gripper(pose), Shape::Box { size }) => {
-            let axis = pose.inverse().rotate([0.0, 1.0, 0.0]);
-            Some((0..3).map(|i| axis[i].abs() * size[i]).sum::<f64>())
-        }
-        (Placement::Gripper(_), Shape::Cylinder { radius, .. }) => Some(2.0 * radius),
+    // The fingers close along the tool's y.
+    let halves = scene.objects.iter().filter_map(|object| match &object.placement {
+        Placement::Gripper(pose) => Some(Geometry::from(&object.shape).extents(pose)[1]),
         _ => None,
     });
-    widths.map(|w| w / 2.0).next().map_or(open, |finger| finger.min(open))
+    halves.take(1).fold(open, f64::min)
 }
 
-/// Whether a link is the hand or a child of it.
-fn is_gripper(robot: &Robot, link: usize) -> bool {
-    let hand = robot.hand();
-    hand.is_some() && (Some(link) == hand || robot.model.links[link].parent == hand)
+/// Whether a link is the hand or carried by it: a finger, or what is fixed to one of them.
+pub(crate) fn is_gripper(robot: &Robot, link: usize) -> bool {
+    let mut above = std::iter::successors(Some(link), |link| robot.model.links[*link].parent);
+    robot.hand().is_some_and(|hand| above.any(|link| link == hand))
 }
 
 /// Covers the bodies of a link with spheres.

@@ -11,6 +11,7 @@
 //! spheres cannot decide ([`Checks::by_shapes`](crate::pairs::Checks::by_shapes)) may be built to run closer to each other than the padding, so
 //! they have none: for these pairs the finished motion is checked, from posture to posture (`validate`).
 
+use crate::arm::is_gripper;
 use crate::cloud::Cloud;
 use crate::confirmed::Couples;
 use crate::frame::compose;
@@ -136,7 +137,9 @@ struct Moving {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Role {
     Arm,
+    /// The hand, or what is fixed to it.
     Hand,
+    /// What the gripper's joint moves.
     Finger,
     Held,
 }
@@ -278,13 +281,13 @@ impl<'a> Checker<'a> {
 
     /// Adds the links of the robot, and what it holds.
     fn add_arm(&mut self, arm: &Mechanism) {
-        let (hand, own) = (self.robot.hand(), self.robot.model.links.len());
+        let (fingers, own) = (self.robot.finger_links(), self.robot.model.links.len());
         for (i, link) in arm.links.iter().enumerate() {
             let moving = match () {
                 () if i >= own => Some((link.name.clone(), self.robot.tool, Role::Held)),
                 () if !self.robot.arm_links.contains(&i) => None,
-                () if Some(i) == hand => Some((format!("link {}", link.name), i, Role::Hand)),
-                () if hand.is_some() && link.parent == hand => Some((format!("link {}", link.name), i, Role::Finger)),
+                () if fingers.contains(&i) => Some((format!("link {}", link.name), i, Role::Finger)),
+                () if is_gripper(self.robot, i) => Some((format!("link {}", link.name), i, Role::Hand)),
                 () => Some((format!("link {}", link.name), i, Role::Arm)),
             };
             let primitives = link.own_bodies().iter().map(|body| Part {

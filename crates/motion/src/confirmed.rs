@@ -74,6 +74,13 @@ impl Couples {
         met
     }
 
+    /// Those that are not among others.
+    pub(crate) fn without(mut self, others: &Couples) -> Couples {
+        self.pairs.retain(|pair| !others.pairs.contains(pair));
+        self.beside.retain(|beside| !others.beside.contains(beside));
+        self
+    }
+
     pub(crate) fn insert(&mut self, what: Met) {
         match what {
             Met::Pair(pair) => drop(self.pairs.insert(pair)),

@@ -19,6 +19,9 @@ use ratn_model::pose::Pose;
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
+/// Number of parts into which the straight way is cut to see where spheres block it.
+const ALONG: u32 = 20;
+
 /// Random postures drawn to find obstructions, and the maximum number of obstructions named.
 const DRAWN: usize = 100;
 const NAMED: usize = 3;
@@ -77,34 +80,43 @@ pub(crate) fn blocked(mechanism: &Mechanism, problem: &Problem, ends: [&[f64]; 2
     let mut lines = Vec::new();
     let straight = exact.touch_along(&ends.map(<[f64]>::to_vec), Space::RESOLUTION.into());
     lines.extend(straight.map(|touch| format!("on the straight way {touch}")));
-    // Per couple: the number of postures in which its shapes collide, and in which only the spheres of two links do.
+    let along: Vec<Vec<f64>> = (1..ALONG)
+        .map(|i| ends[0].iter().zip(ends[1]).map(|(a, b)| a + (b - a) * f64::from(i) / f64::from(ALONG)).collect())
+        .collect();
+    let mut doubts = doubts(mechanism, problem, along.iter().map(Vec::as_slice));
+    // Per couple: the number of drawn postures in which its shapes collide, and in which only its spheres do.
     let mut met: BTreeMap<Met, [usize; 2]> = BTreeMap::new();
-    let (around, mut random) = (pairs::around(mechanism), ChaCha8Rng::seed_from_u64(1));
-    let searched: Vec<Pair> =
-        mechanism.pairs().into_iter().filter(|pair| !mechanism.by_shapes.contains(pair)).collect();
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let coarse = of_spheres(mechanism, ROUNDING_M + overhang_m(problem));
+    let coarse = Exact::new(&coarse, problem.surroundings());
     for _ in 0..DRAWN {
         let posture: Vec<f64> = mechanism.joints.iter().map(|joint| pairs::drawn(joint, &mut random)).collect();
-        let poses = mechanism.poses(&posture);
-        Couples::met(&exact, &posture).into_each(&mut |what| met.entry(what).or_default()[0] += 1);
-        let by_spheres = searched.iter().filter(|pair| pairs::spheres_meet(mechanism, &around, &poses, **pair));
-        by_spheres.for_each(|pair| met.entry(Met::Pair(*pair)).or_default()[1] += 1);
+        let shapes = Couples::met(&exact, &posture);
+        Couples::met(&coarse, &posture).without(&shapes).into_each(&mut |what| met.entry(what).or_default()[1] += 1);
+        shapes.into_each(&mut |what| met.entry(what).or_default()[0] += 1);
     }
+    // The search does not look at the spheres of these pairs.
+    met.retain(|what, [shapes, _]| {
+        *shapes > 0 || !matches!(what, Met::Pair(pair) if mechanism.by_shapes.contains(pair))
+    });
     let mut often: Vec<(&Met, &[usize; 2])> = met.iter().collect();
-    often.sort_by_key(|(_, counts)| Reverse(counts.iter().max().copied()));
-    let mut doubts = Couples::default();
-    for (what, [shapes, spheres]) in &often {
-        if spheres.saturating_sub(*shapes) * 10 > DRAWN {
+    often.sort_by_key(|(_, counts)| Reverse(counts.iter().sum::<usize>()));
+    for (what, [_, spheres]) in &often {
+        if spheres * 10 > DRAWN {
             doubts.insert((*what).clone());
         }
     }
     let named = often.iter().take(NAMED).map(|(what, [shapes, spheres])| {
         let link = |link: usize| &mechanism.links[link].name[..];
-        match what {
-            Met::Pair((a, b)) => {
-                format!("{} and {} in {shapes}, and by their spheres in {}", link(*a), link(*b), spheres.max(shapes))
-            }
-            Met::Beside((a, name)) => format!("{} and {name} in {shapes}", link(*a)),
-        }
+        let (first, second) = match what {
+            Met::Pair((a, b)) => (link(*a), link(*b)),
+            Met::Beside((a, name)) => (link(*a), &name[..]),
+        };
+        let by_spheres = match spheres {
+            0 => String::new(),
+            more => format!(", and by the spheres of the search in {}", shapes + more),
+        };
+        format!("{first} and {second} in {shapes}{by_spheres}")
     });
     let named: Vec<String> = named.collect();
     if !named.is_empty() {

@@ -1,7 +1,7 @@
 //! Continuous joints: the posture is the same after a whole turn, so the shortest way to it is used.
 //!
 //! A search needs limits. For the search the turns are counted differently: the start is moved by whole turns to be near zero, where floating-point
-//! numbers are most exact, and the goals to be near the start; each goal is also offered the other way round, in case the short way is blocked.
+//! numbers are most exact, and the goals to be near the start; each goal is also offered with joints that go the other way round, in case the short ways are blocked.
 //! Results are converted back. So a path begins at the problem's start, and may end whole turns from the given goal.
 
 use crate::drive::wrapped;
@@ -35,6 +35,25 @@ fn bounded(joint: &Joint, lower: f64, upper: f64) -> Joint {
     Joint { lower, upper, endless: false, ..joint.clone() }
 }
 
+/// Maximum number of goals for one posture of continuous joints.
+const WAYS: usize = 16;
+
+/// For each goal that is offered, the joints that go the other way round to it, and their positions there. The goals are in the order of how much
+/// longer their ways are; the first is the nearest one, with no such joint.
+fn ways_round(endless: &[usize], start: &[f64], nearest: &[f64]) -> Vec<Vec<(usize, f64)>> {
+    let mut ways: Vec<(f64, Vec<(usize, f64)>)> = vec![(0.0, Vec::new())];
+    for &j in endless {
+        let way = nearest[j] - start[j];
+        let (longer, position) = (TAU - 2.0 * way.abs(), start[j] + around(way));
+        let also = ways.iter().map(|(far, ways)| (far + longer, [&ways[..], &[(j, position)]].concat()));
+        let also: Vec<_> = also.collect();
+        ways.extend(also);
+        ways.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+        ways.truncate(WAYS);
+    }
+    ways.into_iter().map(|(_, ways)| ways).collect()
+}
+
 /// The displacement to the same position the other way round.
 fn around(way: f64) -> f64 {
     if way > 0.0 { way - TAU } else { way + TAU }
@@ -46,7 +65,7 @@ pub(crate) struct Unwound {
     /// The robot with joint limits around the ends of the problem.
     pub(crate) mechanism: Mechanism,
     pub(crate) start: Vec<f64>,
-    /// The nearest goal first; in each of the others one joint goes the other way round.
+    /// The goals by how far it is to them, the nearest first.
     pub(crate) goals: Vec<Vec<f64>>,
     /// How far each joint was turned back, in radians.
     turned: Vec<f64>,
@@ -57,9 +76,10 @@ pub(crate) fn unwound(mechanism: &Mechanism, start: &[f64], goal: &[f64]) -> Unw
     let mut unwound = Unwound {
         mechanism: mechanism.clone(),
         start: start.to_vec(),
-        goals: vec![goal.to_vec()],
+        goals: Vec::new(),
         turned: vec![0.0; start.len()],
     };
+    let (mut nearest, mut endless) = (goal.to_vec(), Vec::new());
     for (j, joint) in mechanism.joints.iter().enumerate().filter(|(_, joint)| joint.endless) {
         let (Some(&from), Some(&to)) = (start.get(j), goal.get(j)) else { continue };
         if !(from.is_finite() && to.is_finite()) {
@@ -68,12 +88,18 @@ pub(crate) fn unwound(mechanism: &Mechanism, start: &[f64], goal: &[f64]) -> Unw
         let (near, way) = (wrapped(from), wrapped(to - from));
         let around = around(way);
         (unwound.start[j], unwound.turned[j]) = (near, from - near);
-        unwound.goals.iter_mut().for_each(|goal| goal[j] = near + way);
-        let mut other = unwound.goals[0].clone();
-        other[j] = near + around;
-        unwound.goals.push(other);
+        nearest[j] = near + way;
+        endless.push(j);
         unwound.mechanism.joints[j] = bounded(joint, near + way.min(around) - BESIDE, near + way.max(around) + BESIDE);
     }
+    unwound.goals = ways_round(&endless, &unwound.start, &nearest)
+        .into_iter()
+        .map(|ways| {
+            let mut goal = nearest.clone();
+            ways.into_iter().for_each(|(j, position)| goal[j] = position);
+            goal
+        })
+        .collect();
     unwound
 }
 
@@ -127,18 +153,17 @@ impl WithEnds {
         asked
     }
 
-    /// The goal postures for a posture, the nearest first; in each of the others one joint goes the other way round.
+    /// The goal postures for a posture, by how far it is to them, the nearest first.
     fn ways_to(&self, posture: &JointVector) -> impl Iterator<Item = JointVector> {
         let mut nearest = *posture;
         for &j in &self.endless {
             nearest[j] = self.start[j] + wrapped(posture[j] - self.start[j]);
         }
-        let other = move |j: &usize| {
-            let mut other = nearest;
-            other[*j] = self.start[*j] + around(nearest[*j] - self.start[*j]);
-            other
-        };
-        std::iter::once(nearest).chain(self.endless.iter().map(other))
+        ways_round(&self.endless, &self.start, &nearest).into_iter().map(move |ways| {
+            let mut goal = nearest;
+            ways.into_iter().for_each(|(j, position)| goal[j] = position);
+            goal
+        })
     }
 
     /// A motion with the arm's own count of turns.

@@ -17,7 +17,7 @@
 use crate::diagnosis;
 use crate::exact::Exact;
 use crate::mechanism::Mechanism;
-use crate::robot_model::{Joint, RobotModel};
+use crate::robot_model::{Joint, RobotModel, WIDEST};
 use crate::robot_state::RobotState;
 use crate::spheres::Sphere;
 use crate::vector::Vector;
@@ -241,8 +241,10 @@ fn tallies(model: &RobotModel, checks: Checks, look: Look) -> BTreeMap<Pair, Tal
     tallies
 }
 
+/// A random position of a joint. A limit that is farther away than any robot is long or turns stands for none, as infinity does: some programs
+/// write the greatest number that they know.
 pub(crate) fn drawn(joint: &Joint, random: &mut impl Rng) -> f64 {
-    let (lower, upper) = match (joint.lower.is_finite(), joint.upper.is_finite()) {
+    let (lower, upper) = match (joint.lower.abs() <= WIDEST, joint.upper.abs() <= WIDEST) {
         (true, true) => (joint.lower, joint.upper),
         (true, false) => (joint.lower, joint.lower + 2.0 * ENDLESS),
         (false, true) => (joint.upper - 2.0 * ENDLESS, joint.upper),

@@ -21,7 +21,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::f64::consts::TAU;
 
 /// Maximum range of a planned joint, in radians (metres for a prismatic joint).
-const WIDEST: f64 = 1e4;
+pub(crate) const WIDEST: f64 = 1e4;
 
 /// Maximum number of turns from zero of a continuous joint.
 pub(crate) const MOST_TURNS: f64 = 1e4;

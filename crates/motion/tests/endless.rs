@@ -109,6 +109,25 @@ fn where_the_short_way_is_blocked_it_turns_the_other_way() {
 }
 
 #[test]
+fn where_the_short_ways_of_two_joints_are_blocked_both_turn_the_other_way() {
+    let hand = |name: &str, x: f64| {
+        format!(
+            "<link name='{name}'><collision><origin xyz='0.2 0 0'/><geometry><box size='0.36 0.02 0.02'/></geometry></collision></link>\
+             <joint name='{name}_turns' type='continuous'><parent link='foot'/><child link='{name}'/><origin xyz='{x} 0 0'/><axis xyz='0 0 1'/></joint>"
+        )
+    };
+    let urdf = format!("<robot name='r'><link name='foot'/>{}{}</robot>", hand("first", 0.0), hand("second", 1.0));
+    let mechanism = Mechanism::read(&urdf, None, &["first_turns".to_owned(), "second_turns".to_owned()]).unwrap();
+    let post = |x: f64| {
+        let pose = Pose::at(x - 0.3, 0.0, 0.0);
+        Obstacle { name: format!("post {x}"), pose, geometry: Geometry::Sphere { radius: 0.03 } }
+    };
+    let (start, goal) = ([2.7, 2.8], [-2.7, -2.8]);
+    let way = (TAU - 2.0 * 0.442_f64).hypot(TAU - 2.0 * 0.342) as f32;
+    check(&solve(&mechanism, start, goal, &[post(0.0), post(1.0)]).unwrap(), start, goal, way - 0.2..way + 0.2);
+}
+
+#[test]
 fn joints_with_limits_and_those_that_others_follow_turn_as_before() {
     let (start, goal) = ([3.0, 0.0], [-3.0, 0.0]);
     let limited = clock("revolute", "");

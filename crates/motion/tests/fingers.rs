@@ -3,9 +3,13 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
+use ratn_model::pose::Pose;
+use ratn_motion::arm;
+use ratn_motion::collision::{Checker, Contact};
 use ratn_motion::description::RobotDescription;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{ArmPosition, Configuration, Robot, UNSAID};
+use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 
 /// A hand whose fingers slide along the hand's x axis; the tool is turned so that they close along its y. A finger is a bracket and a pad.
 fn urdf(arms: &[&str]) -> String {
@@ -100,6 +104,61 @@ fn a_robot_is_the_same_by_what_moves_and_collides_and_its_parts_not_by_its_file(
     assert_ne!(robot(&["one", "two"]).identity(), robot(&["one"]).identity());
     let two = robot(&["one", "two"]);
     assert_ne!(two.with_arm("two").unwrap().identity(), two.identity(), "another arm is the first");
+}
+
+/// The paper's robot with a plate fixed beside one of its links, 6 cm from the middle of the hand; `to` is the link and the place on it.
+fn with_plate(link: &str, xyz: &str) -> Robot {
+    let read =
+        |ending: &str| std::fs::read_to_string(format!("{}/robots/aimm.{ending}", env!("CARGO_MANIFEST_DIR"))).unwrap();
+    let plate = format!(
+        "<link name='plate'><collision><geometry><box size='0.02 0.02 0.02'/></geometry></collision></link>\
+         <joint name='plate_mount' type='fixed'><parent link='{link}'/><child link='plate'/><origin xyz='{xyz}'/></joint></robot>"
+    );
+    let srdf =
+        read("srdf").replace("</robot>", "<disable_collisions link1='hand' link2='plate' reason='Adjacent'/></robot>");
+    let description = RobotDescription::read(&read("toml")).unwrap();
+    Robot::of(description, &read("urdf").replace("</robot>", &plate), Some(&srdf), &mut |_| unreachable!()).unwrap()
+}
+
+#[test]
+fn what_is_fixed_to_the_hand_presses_nothing_and_what_is_fixed_to_a_finger_may() {
+    let pressed = |link: &str, xyz: &str| {
+        let robot = with_plate(link, xyz);
+        let home = robot.posture("home").unwrap();
+        let empty = Scene { base: Pose::IDENTITY, objects: Vec::new() };
+        let here = Configuration { arm: home, ..arm::assumed(&robot, &empty) };
+        // A ball that is 5 mm deep in the plate, from the side.
+        let plate = robot.poses(&here)[robot.link("plate").unwrap()];
+        let ball = SceneObject {
+            name: "ball".to_owned(),
+            shape: Shape::Cylinder { radius: 0.01, length: 0.02 },
+            placement: Placement::World(plate.compose(&Pose::at(0.015, 0.0, 0.0))),
+        };
+        let scene = Scene { base: Pose::IDENTITY, objects: vec![ball] };
+        let mut checker = Checker::new(&robot, &scene, &arm::assumed(&robot, &scene), 0.0);
+        assert!(checker.collision(&home, Contact::None).is_some());
+        checker.collision(&home, Contact::Gripper(0.006)).map(|touch| touch.to_string())
+    };
+    let bracket = pressed("hand", "0.08 0 0.05").unwrap();
+    assert!(bracket.contains("plate") && bracket.contains("ball"), "{bracket}");
+    assert_eq!(pressed("finger_left", "0.06 0 0.03"), None);
+}
+
+#[test]
+fn fingers_are_around_what_they_hold_however_it_lies_in_them() {
+    let robot = Robot::aimm();
+    let held = |shape: Shape, turned_rad: f64| {
+        let placement = Placement::Gripper(Pose::from_rpy([0.0; 3], turned_rad, 0.0, 0.0));
+        let objects = vec![SceneObject { name: "can".to_owned(), shape, placement }];
+        arm::assumed(&robot, &Scene { base: Pose::IDENTITY, objects }).finger
+    };
+    let can = Shape::Cylinder { radius: 0.02, length: 0.1 };
+    let quarter = std::f64::consts::FRAC_PI_2;
+    for (shape, turned_rad, finger) in
+        [(can.clone(), 0.0, 0.02), (can, quarter, 0.05), (Shape::Box { size: [0.03, 0.04, 0.1] }, quarter, 0.05)]
+    {
+        assert!((held(shape, turned_rad) - finger).abs() < 1e-9, "{turned_rad}");
+    }
 }
 
 #[test]

@@ -81,6 +81,24 @@ fn only_neighbours_that_touch_and_what_always_meets_are_not_checked() {
 }
 
 #[test]
+fn limits_as_far_as_numbers_go_stand_for_none() {
+    let kinds = |limit: &str| {
+        let sled = format!(
+            "<link name='base'/><link name='sled'/><joint name='slide' type='prismatic'><parent link='base'/><child link='sled'/><axis xyz='1 0 0'/>\
+             <limit lower='-{limit}' upper='{limit}' velocity='1' effort='1'/></joint>"
+        );
+        let arm = [ball("low", "sled", "0 0 0", "0.1 0 0"), ball("high", "low", "0.3 0 0", "-0.1 0.12 0")];
+        let end = ball("end", "high", "-0.1 0.12 0", "-0.12 -0.1 0");
+        pairs::kinds(&RobotModel::read(&format!("<robot name='r'>{sled}{}{end}</robot>", arm.concat()), None).unwrap())
+    };
+    let without = kinds("inf");
+    assert!(!without.contains_key(&Kind::Always), "{without:?}");
+    for farthest in [f64::MAX.to_string(), f32::MAX.to_string(), "1e30".to_owned()] {
+        assert_eq!(kinds(&farthest), without, "{farthest}");
+    }
+}
+
+#[test]
 fn neighbours_that_fold_onto_each_other_are_checked() {
     // Beyond its elbow, which is wide open at zero, the forearm meets the upper arm.
     let links = [ball("upper", "base", "0 0 0", "0.1 0 0"), ball("fore", "upper", "0.2 0 0", "0.1 0 0")];

@@ -2,11 +2,13 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
+use ratn_model::pose::Pose;
 use ratn_motion::connect::{Budget, ConnectError};
 use ratn_motion::exact::Exact;
+use ratn_motion::geometry::Geometry;
 use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
 use ratn_motion::problems::Problem;
-use ratn_motion::space::Space;
+use ratn_motion::space::{Obstacle, Space};
 use ratn_motion::trial::{self, Settings, Trial};
 
 /// Excepts nothing that matters, so that all pairs with shapes are checked.
@@ -51,6 +53,35 @@ fn ends_that_only_the_spheres_find_touching_are_no_refusal_and_the_way_between_i
     let found = run(&mechanism, [0.0, 0.0], [1.2, 0.0]).outcome.unwrap();
     assert_eq!(found.touch, None);
     assert!(found.path.iter().any(|posture| posture[1] > 0.096), "{:?}", found.path);
+}
+
+#[test]
+fn a_slot_that_only_the_spheres_find_too_narrow_is_passed_by_the_shapes() {
+    let urdf = "<robot name='r'><link name='foot'/><link name='plate'><collision><geometry><box size='0.6 0.6 0.02'/></geometry></collision></link>\
+                <joint name='along' type='prismatic'><parent link='foot'/><child link='plate'/><axis xyz='1 0 0'/>\
+                <limit lower='-1.5' upper='1.5' velocity='1' effort='1'/></joint></robot>";
+    let mechanism = Mechanism::read(urdf, None, &[]).unwrap();
+    let shelf = |name: &str, z: f64| Obstacle {
+        name: name.to_owned(),
+        pose: Pose::at(0.0, 0.0, z),
+        geometry: Geometry::Box { half: [0.15, 1.0, 0.05] },
+    };
+    let pass = |gap_m: f64| {
+        let z = 0.06 + gap_m;
+        let obstacles = vec![shelf("upper", z), shelf("lower", -z)];
+        let problem = Problem { obstacles, start: vec![-1.0], goal: vec![1.0], ..Problem::default() };
+        let settings = Settings { budget: Budget { iterations: 500, seed: 1 }, repetitions: 1, limit: f64::INFINITY };
+        trial::run(&mechanism, &problem, settings, &mut || 0.0)
+    };
+    let found = pass(0.003).outcome.unwrap();
+    assert_eq!((found.touch, found.path.len()), (None, 2));
+    // Too narrow for the shapes, too.
+    let refused = pass(-0.003);
+    assert!(
+        refused.outcome.is_err() && refused.diagnosis.concat().contains("plate and lower"),
+        "{:?}",
+        refused.diagnosis
+    );
 }
 
 #[test]
