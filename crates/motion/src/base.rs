@@ -198,6 +198,7 @@ pub fn plan_drive(
     if robot.base_joints().is_empty() {
         return Err(DriveError::NoBase { robot: robot.name().to_owned() });
     }
+    let request = &DriveRequest { start: robot.within_limits(&request.start), ..request.clone() };
     request.check(robot)?;
     let here = request.start.with_base(&scene.base);
     let riding = riding(robot, scene);

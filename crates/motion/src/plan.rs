@@ -74,6 +74,8 @@ pub fn plan(
     request: &Request,
     control: &mut dyn FnMut(Progress<'_>) -> Control,
 ) -> Result<Plan, PlanError> {
+    // An encoder may read a little beyond a limit at which the joint stands.
+    let request = &Request { start: robot.within_limits(&request.start), ..request.clone() };
     request.check(robot, scene)?;
     let Some(arm) = WithEnds::about(robot, &request.start.arm) else {
         return plan_with_ends(robot, scene, request, control);

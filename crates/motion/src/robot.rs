@@ -21,6 +21,7 @@ use crate::robot_state::RobotState;
 use crate::space::Obstacle;
 pub use crate::urdf::RobotError;
 pub use crate::urdf_faults::UrdfFault;
+use crate::validate::POSITION_TOLERANCE;
 use crate::workplace::Workplace;
 use arms::OtherArm;
 pub use arms::{ArmPosition, MAX_ARMS, OtherArms, UNSAID};
@@ -536,6 +537,23 @@ impl Robot {
     /// The index of a link.
     pub fn link(&self, name: &str) -> Option<usize> {
         self.model.link(name)
+    }
+
+    /// The same with the positions of arm, head and fingers that are beyond a limit by no more than trajectories may be moved to the limit.
+    pub(crate) fn within_limits(&self, at: &Configuration) -> Configuration {
+        let within = |joint: &Joint, position: f64| match joint.allows(position, POSITION_TOLERANCE) {
+            true => joint.clamp(position),
+            false => position,
+        };
+        let mut moved = *at;
+        moved.arm.iter_mut().zip(self.arm_joints()).for_each(|(position, joint)| *position = within(joint, *position));
+        for (position, joint) in [&mut moved.pan, &mut moved.tilt].into_iter().zip(self.head_joints()) {
+            *position = within(joint, *position);
+        }
+        if let Some(joint) = self.finger() {
+            moved.finger = within(joint, moved.finger);
+        }
+        moved
     }
 
     /// Poses of all links in the world frame.

@@ -17,7 +17,7 @@ pub const START_TOLERANCE_RAD: f64 = 0.01;
 const LIMIT_TOLERANCE: f64 = 0.01;
 
 /// By how much a position may exceed its limit, in radians or metres.
-const POSITION_TOLERANCE: f64 = 1e-3;
+pub(crate) const POSITION_TOLERANCE: f64 = 1e-3;
 
 /// Why a trajectory may not be followed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

@@ -154,7 +154,7 @@ fn ungrasping(view: &Robot, is_first: bool, boxes: Option<&Boxes>, of_arm: &str)
             .then(|| unmet("there is none".to_owned(), "the boxes are taken with it", "add one (docs/robots.md)"))?;
     };
     let name = &view.model.links[finger].name;
-    let Some(part) = Pads::part(view) else {
+    let Some(part) = view.pad() else {
         return unmet(
             format!(
                 "none of the shapes of its finger `{name}` is a box that lies along the axes of the tool's frame, or a mesh"

@@ -94,16 +94,8 @@ const PAD_GIVE_M: f64 = 0.002;
 impl Pads {
     /// The pads of a robot's gripper. `None` if no box of the finger is aligned with the tool's axes and none of its shapes is a mesh.
     pub fn of(robot: &Robot) -> Option<Pads> {
-        let FingerPart { middle: [x, _, z], half, .. } = Pads::part(robot)?;
+        let FingerPart { middle: [x, _, z], half, .. } = robot.pad()?;
         Some(Pads { x: [x - half[0], x + half[0]], z_from: z - half[2], z_to: z + half[2], thick: 2.0 * half[1] })
-    }
-
-    /// The finger's box that is nearest to the other finger where both meet, among the boxes aligned with the tool's axes and the pads of its
-    /// meshes.
-    pub(super) fn part(robot: &Robot) -> Option<FingerPart> {
-        let inner_m = |part: &FingerPart| part.middle[1].abs() - part.half[1];
-        let boxes = robot.finger_parts().into_iter().filter(|part| part.is_flat);
-        boxes.min_by(|a, b| inner_m(a).total_cmp(&inner_m(b)))
     }
 
     /// What the fingers hold when they close from `finger` metres on each side of the middle.

@@ -41,6 +41,19 @@ impl Robot {
         primitives.chain(meshes).collect()
     }
 
+    /// The pad of the finger: of its flat parts the one that is nearest to the other finger where both meet. `None` if none is flat, and for a robot
+    /// without a gripper.
+    pub fn pad(&self) -> Option<FingerPart> {
+        nearest(self.finger_parts().into_iter().filter(|part| part.is_flat))
+    }
+
+    /// How thick the finger is at its pad, along its closing direction, in metres; 0 for a robot without fingers. Where no part is flat, that of the
+    /// part which is nearest to the other finger.
+    pub(crate) fn finger_thickness_m(&self) -> f64 {
+        let part = self.pad().or_else(|| nearest(self.finger_parts().into_iter()));
+        part.map_or(0.0, |part| 2.0 * part.half[1])
+    }
+
     /// Each link that the gripper's joint moves, with its translation in the tool's frame between the joint at zero and at its upper limit; none
     /// for a robot without a gripper.
     pub fn finger_ways(&self) -> Vec<(usize, [f64; 3])> {
@@ -70,6 +83,12 @@ impl Robot {
         };
         (seen(&of_link).unwrap_or(Pose::IDENTITY), seen(&of_tool).unwrap_or(Pose::IDENTITY))
     }
+}
+
+/// The part that is nearest to the other finger.
+fn nearest(parts: impl Iterator<Item = FingerPart>) -> Option<FingerPart> {
+    let inner_m = |part: &FingerPart| part.middle[1].abs() - part.half[1];
+    parts.min_by(|a, b| inner_m(a).total_cmp(&inner_m(b)))
 }
 
 /// The pad of a mesh of a finger that opens along the tool's y, or in the opposite direction if `outward` is negative.
