@@ -101,7 +101,8 @@ impl BySpheres {
             link.meshes.clear();
             link.covers = 0;
             for (i, body) in std::mem::take(&mut link.bodies).into_iter().enumerate() {
-                let name = format!("link {} {i}", arm.links[index].name);
+                // No object of a scene has a name with a control character.
+                let name = format!("link {} {i}\0", arm.links[index].name);
                 arm.allowed.extend(beside.iter().map(|link| (*link, name.clone())));
                 obstacles.push(Obstacle {
                     name,

@@ -17,7 +17,7 @@
 use crate::joint_vector::JointVector;
 use crate::line::{self, Cause, FINEST, Lines, MAX_JUMP, MAX_STEPS, STRAY_M, Traced};
 use crate::pace::{Control, Stop};
-use crate::reach::{Reach, Target};
+use crate::reach::Reach;
 use ratn_model::pose::Pose;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap};
@@ -95,7 +95,7 @@ pub(crate) fn climb(
     }
     let Some(first) = rungs.first() else { return Ok(None) };
     let pose = lines.pieces[first.piece].at(first.from);
-    let mut postures = reach.family(&Target::at(pose), start);
+    let mut postures = reach.family(&reach.target(pose), start);
     postures.insert(0, *start);
     let count = postures.len();
     let (failed, followed) = (BTreeSet::new(), BTreeSet::new());
@@ -197,7 +197,7 @@ impl Ladder<'_> {
     fn make(&mut self, rung: usize) -> bool {
         if rung == self.postures.len() {
             let Rung { piece, to, .. } = self.rungs[rung - 1];
-            let target = Target::at(self.lines.pieces[piece].at(to));
+            let target = self.reach.target(self.lines.pieces[piece].at(to));
             let postures = self.reach.family(&target, &self.postures[0][0]);
             self.count += postures.len();
             self.postures.push(postures);
@@ -256,7 +256,7 @@ impl Ladder<'_> {
                 for k in 1..way.len() - 1 {
                     let [before, here, after] = [postures[k - 1], postures[k], postures[k + 1]];
                     let mean = JointVector::from_fn(here.len(), |j| (before[j] + 2.0 * here[j] + after[j]) / 4.0);
-                    let target = Target::at(self.pose(way[k].0));
+                    let target = self.reach.target(self.pose(way[k].0));
                     postures[k] = self.reach.descend(&target, &mean).unwrap_or(here);
                 }
             }

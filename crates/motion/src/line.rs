@@ -10,7 +10,7 @@ use crate::frame::compose;
 use crate::joint_vector::JointVector;
 use crate::ladder;
 use crate::pace::{Control, Stop};
-use crate::reach::{Reach, Target, rotation_vector};
+use crate::reach::{Reach, rotation_vector};
 use crate::robot_model::Joint;
 use crate::vector::{Vector, position};
 use ratn_model::pose::Pose;
@@ -235,7 +235,7 @@ pub(crate) fn nearest(
 /// The next posture on a line: the one that a descent from `seed` finds.
 pub(crate) fn step(reach: &Reach, here: &JointVector, seed: &JointVector, to: &Pose) -> Result<JointVector, Cause> {
     let joints = reach.limits();
-    let Some(next) = reach.descend(&Target::at(*to), seed) else {
+    let Some(next) = reach.descend(&reach.target(*to), seed) else {
         let held = |(joint, q): &(&Joint, &f64)| (joint.upper - **q).min(**q - joint.lower) < AT_LIMIT;
         let limit = joints.iter().zip(here).find(held).map(|(joint, _)| joint.name.clone());
         return Err(limit.map_or(Cause::OutOfReach, |joint| Cause::Limit { joint }));

@@ -7,7 +7,6 @@ use crate::diagnosis::no_joint_parts;
 use crate::joint_vector::JointVector;
 use crate::pairs::{self, Pair};
 use crate::plan::has_room;
-use crate::reach::Target;
 use crate::request::unit;
 use crate::robot::{Configuration, Joint, Robot};
 use crate::robot_model::RobotModel;
@@ -287,7 +286,7 @@ fn beyond(robot: &Robot, workplace: &Workplace, floor: &Pose) -> Option<String> 
     let size = workplace.boxes.greatest;
     let mut why = "no posture of the arm gets there".to_owned();
     for grasp in grasp_poses(&floor.compose(&Pose::at(0.0, 0.0, size[2] / 2.0)), size) {
-        for posture in reach.solutions(&Target::at(grasp), &home, SOLUTIONS, TRIES, &mut random) {
+        for posture in reach.solutions(&reach.target(grasp), &home, SOLUTIONS, TRIES, &mut random) {
             match line(&reach, &posture, [0.0, 0.0, APPROACH_M]) {
                 Err(error) => why = error.to_string(),
                 Ok(postures) => {

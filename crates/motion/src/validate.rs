@@ -48,7 +48,7 @@ pub enum Violation {
         time_s: f64,
     },
     /// A position, velocity, acceleration or jerk exceeds its limit.
-    #[error("{joint} reaches {what} {value:.3} at {time_s:.3} s, its limit is {limit:.3}")]
+    #[error("{joint} reaches {what} {value:.3} in the part that begins at {time_s:.3} s, its limit is {limit:.3}")]
     Limit {
         /// The joint.
         joint: String,

@@ -14,7 +14,7 @@ use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
 use ratn_motion::pace::Control;
 use ratn_motion::pairs::{self, Kind, Pair};
 use ratn_motion::plan::{Goal, Request, plan};
-use ratn_motion::robot::Robot;
+use ratn_motion::robot::{Configuration, Robot};
 use ratn_motion::robot_model::RobotModel;
 use ratn_motion::space::Space;
 use ratn_motion::validate::validate_trajectory;
@@ -78,6 +78,32 @@ fn only_neighbours_that_touch_and_what_always_meets_are_not_checked() {
     let touch = exact.touch(&[0.0; 5]).unwrap();
     assert_eq!((&touch.link[..], &touch.other[..]), ("upper", "lever"));
     assert_eq!(exact.touch(&[0.0, 0.0, 0.0, 1.5, 0.0]), None);
+}
+
+#[test]
+fn an_object_with_the_name_of_a_link_is_checked_against_what_the_link_is_not() {
+    let robot = Robot::aimm();
+    let home = robot.posture("home").unwrap();
+    let empty = Scene { base: Pose::IDENTITY, objects: Vec::new() };
+    let here = Configuration { arm: home, ..arm::assumed(&robot, &empty) };
+    let (mechanism, _) = arm::in_scene(&robot, &empty, &here);
+    let poses = mechanism.poses(&home);
+    let mut names = 0;
+    for (link, name) in mechanism.allowed.iter().filter(|(link, _)| !mechanism.links[*link].spheres.is_empty()) {
+        let body = SceneObject {
+            name: name.trim_matches(char::is_control).to_owned(),
+            shape: Shape::Box { size: [0.02; 3] },
+            placement: Placement::World(
+                poses[*link].compose(&Pose { position: mechanism.links[*link].spheres[0].centre, ..Pose::IDENTITY }),
+            ),
+        };
+        let scene = Scene { objects: vec![body], ..empty.clone() };
+        let (mechanism, standing) = arm::in_scene(&robot, &scene, &here);
+        let state = std::array::from_fn(|j| home.get(j).map_or(0.0, |q| *q as f32));
+        assert!(!arm::space(&mechanism, &standing[..]).is_free(&state), "{name}");
+        names += 1;
+    }
+    assert!(names > 0);
 }
 
 #[test]

@@ -18,7 +18,7 @@ use crate::leaving::{Leaving, NOTHING_NEW};
 use crate::line::{self, Cause, LineError, Lines};
 use crate::pace::{Pace, Stop};
 use crate::pressing::{Pressing, straight_collision};
-use crate::reach::{Postures, Reach, Target};
+use crate::reach::{Postures, Reach};
 use crate::refine::{End, Measure, Refinement};
 use crate::request::{Request, kept_out};
 use crate::robot::{Configuration, Geometry, Robot};
@@ -311,7 +311,7 @@ impl<'a> ArmInScene<'a> {
 
     /// All postures for a pose of the tool in the world frame.
     pub(super) fn postures(&self, pose: &Pose) -> Postures {
-        self.reach.postures(&Target::at(self.base.inverse().compose(pose)))
+        self.reach.postures(&self.reach.target(self.base.inverse().compose(pose)))
     }
 
     /// Some of these postures, the nearest to `near` first; every attempt returns others.

@@ -6060,7 +6060,7 @@ pub struct Goal {
     /// The projection (the predicted world) that the action works on; unset if it needs none.
     #[prost(uint64, optional, tag = "6")]
     pub projection_id: ::core::option::Option<u64>,
-    /// The endpoint of the world pool that has this projection; empty if the action needs none.
+    /// The endpoint of the world pool that has this projection; empty if the state says that it reads no facts.
     #[prost(string, tag = "7")]
     pub world_pool_endpoint: ::prost::alloc::string::String,
     /// Deadline: the goal is cancelled this long after its arrival, in milliseconds of wall time; 0 for no deadline.

@@ -65,7 +65,11 @@ impl Performer {
                 lease: goal.lease,
                 session: self.run.clone(),
                 projection: goal.projection,
-                world_pool: self.world.endpoint().to_string(),
+                // What says that it reads nothing begins whenever it can, and would see another world in every run.
+                world_pool: match goal.projection {
+                    None if goal.reads_nothing => String::new(),
+                    _ => self.world.endpoint().to_string(),
+                },
                 deadline_ms: goal::deadline_ms(goal.timeout_s, self.speed),
                 grace_ms: goal::GRACE_MS,
                 improves: goal.improves.map(Vec::from),

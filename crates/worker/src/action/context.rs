@@ -67,8 +67,10 @@ pub struct GoalContext {
 /// Why the world cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum WorldFailure {
-    /// The goal names no world pool.
-    #[error("the goal names no world pool")]
+    /// The goal names no world pool: its state reads nothing.
+    #[error(
+        "the goal's state says that it reads no facts (`reads: []`), so it is shown none; declare what it reads (reads: […])"
+    )]
     NoWorldPool,
     /// The goal's address of the world pool is no endpoint.
     #[error("the goal's world pool")]

@@ -373,6 +373,26 @@ async fn a_motion_that_reads_nothing_does_not_wait_for_what_was_decided_before_i
 }
 
 #[tokio::test]
+async fn a_goal_that_reads_nothing_is_shown_no_facts() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let instance = InstanceId(1);
+    bench.ask(instance)?;
+    let lease = bench.granted(instance).await?;
+    let (_arm, endpoint) = serve_arm(&mut bench).await?;
+    for (attempt, reads_nothing) in [(1, false), (2, true)] {
+        let Command::Start { goal, .. } = start(instance, attempt, "look", lease, &endpoint) else {
+            bail!("it is a start")
+        };
+        let goal = Box::new(Goal { reads_nothing, ..*goal });
+        bench.performer.perform(Command::Start { instance, attempt, goal })?;
+        let Some(Event::Finished { outcome, reason, .. }) = bench.event().await else { bail!("it has not ended") };
+        assert_eq!(outcome == SUCCESS, !reads_nothing, "{outcome}: {reason}");
+        assert_eq!(reason.contains("reads: []"), reads_nothing, "{reason}");
+    }
+    bench.performer.closed().await
+}
+
+#[tokio::test]
 async fn an_int_for_a_float_port_reaches_the_provider_as_a_float() -> anyhow::Result<()> {
     let mut bench = Bench::new().await?;
     let action = ActionSignature { inputs: [("exposure_s".to_owned(), Type::Float)].into(), ..Default::default() };

@@ -329,7 +329,7 @@ fn delete(kind: &str) -> Requirement {
     Requirement::new(ResourceOperation::Delete, kind)
 }
 
-/// `hang` ends when it is cancelled, `brake` a while after that, `work` at once.
+/// `hang` ends when it is cancelled, `brake` a while after that, `look` when it has seen all facts, `work` at once.
 struct Arm(&'static str);
 
 #[tonic::async_trait]
@@ -348,14 +348,18 @@ impl Action for Arm {
             tokio::time::sleep(Duration::from_millis(300)).await;
             return Err(goal.stopped());
         }
+        if self.0 == "look" {
+            goal.facts(&[]).await?;
+        }
         Ok(GoalOutcome::success())
     }
 }
 
 /// Lets the bench's arm perform goals.
 async fn serve_arm(bench: &mut Bench) -> anyhow::Result<(ActionServer, String)> {
-    let arm = ActionServer::builder("").one_at_a_time().action(Arm("hang")).action(Arm("brake")).action(Arm("work"));
-    let arm = arm.build();
+    let arm = ["hang", "brake", "look", "work"].map(Arm);
+    let arm =
+        arm.into_iter().fold(ActionServer::builder("").one_at_a_time(), |server, action| server.action(action)).build();
     let bound = bind(&Endpoint::Unix(bench._place.path().join("arm.sock"))).await?;
     let endpoint = bound.endpoint().to_string();
     tokio::spawn(bound.serve(Services::new().with(arm.clone().into_service()), CancellationToken::new()));
