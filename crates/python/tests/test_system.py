@@ -23,7 +23,7 @@ from conftest import ROOT, Place, program
 EXAMPLE = ROOT / "examples" / "fetch_boxes.yaml"
 
 
-@ratn.step
+@ratn.step(reads=[])
 def measure(of: int = 0) -> TypedDict("Measured", {"value": float}):
     return {"value": of + 0.5}
 

@@ -193,7 +193,7 @@ def test_the_steps_of_a_run_are_done_by_its_own_workers(system: ratn.System, tmp
     import runpy
 
     (tmp_path / "other").mkdir()
-    step = "import os\nimport ratn\n\n@ratn.step\ndef who(of: int = 0) -> dict:\n    return {'pid': os.getpid(), 'file': __file__}\n"
+    step = "import os\nimport ratn\n\n@ratn.step(reads=[])\ndef who(of: int = 0) -> dict:\n    return {'pid': os.getpid(), 'file': __file__}\n"
     (tmp_path / "other" / "whose.py").write_text(step)
     script = tmp_path / "whose.py"
     script.write_text(
@@ -214,12 +214,27 @@ def test_the_steps_of_a_run_are_done_by_its_own_workers(system: ratn.System, tmp
         assert {*result.outputs["files"]} == {str(script)} and result.outputs["other"] == str(tmp_path / "other" / "whose.py")
 
 
+def test_a_step_that_says_nothing_may_do_anything_and_one_that_says_what_it_reads_computes(tmp_path: pathlib.Path) -> None:
+    import runpy
+
+    script = tmp_path / "said.py"
+    script.write_text(
+        "import ratn\n\n@ratn.step\ndef plain() -> None: ...\n\n@ratn.step(reads=[])\ndef looks_at_nothing() -> None: ...\n\n"
+        "@ratn.step(computes=True)\ndef works() -> None: ...\n\n@ratn.step(effects=['done()'])\ndef does() -> None: ...\n\n"
+        "@ratn.task\ndef said() -> None:\n    plain()\n    looks_at_nothing()\n    works()\n    does()\n"
+    )
+    states = runpy.run_path(str(script), run_name="said")["said"].document["states"]
+    said = {name: {key: state[key] for key in ("computes", "reads", "effects") if key in state} for one in states for name, state in one.items()}
+    computes = {"computes": True, "reads": []}
+    assert said == {"plain": {}, "looks_at_nothing": computes, "works": computes, "does": {"effects": ["done()"]}}, said
+
+
 def test_a_worker_of_steps_that_dies_is_replaced_and_not_for_ever(system: ratn.System, tmp_path: pathlib.Path) -> None:
     import runpy
 
     script = tmp_path / "dying.py"
     script.write_text(
-        "import os, pathlib, ratn\n\n@ratn.step\ndef die(times: int) -> dict:\n    died = pathlib.Path(__file__).with_suffix(f'.{times}')\n"
+        "import os, pathlib, ratn\n\n@ratn.step(reads=[])\ndef die(times: int) -> dict:\n    died = pathlib.Path(__file__).with_suffix(f'.{times}')\n"
         "    before = len(died.read_text()) if died.exists() else 0\n    if before < times:\n        died.write_text('x' * (before + 1))\n        os._exit(3)\n"
         "    return {'before': before}\n\n"
         "@ratn.task\ndef dying(times: int = 1) -> dict:\n    it = die(times=times)\n    return {'before': it.before}\n"

@@ -124,10 +124,10 @@ def step(
     outputs: dict[str, Any] | None = None,
     outcomes: Iterable[str] = (),
     computes: bool | None = None,
-    reads: Iterable[str] = (),
+    reads: Iterable[str] | None = None,
     senses: Iterable[str] = (),
     requires: Iterable[str] = (),
-    effects: Iterable[str] = (),
+    effects: Iterable[str] | None = None,
 ) -> Callable[[Callable[..., Any]], Step]: ...
 def step(
     function: Callable[..., Any] | None = None,
@@ -136,19 +136,23 @@ def step(
     outputs: dict[str, Any] | None = None,
     outcomes: Iterable[str] = (),
     computes: bool | None = None,
-    reads: Iterable[str] = (),
+    reads: Iterable[str] | None = None,
     senses: Iterable[str] = (),
     requires: Iterable[str] = (),
-    effects: Iterable[str] = (),
+    effects: Iterable[str] | None = None,
 ) -> Step | Callable[[Callable[..., Any]], Step]:
     """Makes a function a step: in a task, its call is a state that a worker of the run performs.
 
-    Parameters are as in ``Worker.action``, but the goal may be omitted. The worker executes the step's file: code for the program that starts the run
+    Parameters are as in ``Worker.action``, but the goal may be omitted. A step that says nothing of ``computes``, ``reads``, ``senses`` and ``effects``
+    may do anything, so it runs in its order. One that says any of these has no effects and reads no facts beyond what it says: ``reads=[]`` is enough
+    for one that only computes, which runs ahead, also on ways that are not taken. The worker executes the step's file: code for the program that starts the run
     belongs below ``if __name__ == "__main__":``.
     """
     # The arguments may be iterators, and are needed twice: here, and by the worker.
-    outcomes, reads, senses, requires, effects = (list(said) for said in (outcomes, reads, senses, requires, effects))
-    computes = not (senses or effects) if computes is None else computes
+    outcomes, senses, requires = list(outcomes), list(senses), list(requires)
+    if senses or not (computes is None and reads is None and effects is None):
+        reads, effects = list(reads or ()), list(effects or ())
+        computes = not (senses or effects) if computes is None else computes
     said = {"outputs": outputs, "outcomes": outcomes, "computes": computes, "reads": reads, "senses": senses, "requires": requires, "effects": effects}
     return (lambda function: Step(function, name, said)) if function is None else Step(function, name, said)
 
