@@ -3,7 +3,7 @@
 use super::instance::{Activity, Cause, Ending, Instance, Job, Stage};
 use super::{Changed, Commit, Span, Timeline};
 use ratn_event_log::without_visits;
-use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine, Note, Origin};
+use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine, Mode, Note, Origin};
 use ratn_model::id::InstanceId;
 use ratn_model::program::SUCCESS;
 use ratn_model::resource::LeasedResource;
@@ -367,7 +367,8 @@ impl Timeline {
     fn starts(&mut self, id: InstanceId, at: f64, attempt: u32, goal: &Goal) {
         let path = self.known(id, at).path.clone();
         let activity = self.hints.activity(&path, goal);
-        let ahead_of_time = self.open.range(..id).next().is_some();
+        // In the sequential mode an older instance that is open is of another region.
+        let ahead_of_time = self.mode == Mode::Cdtn && self.open.range(..id).next().is_some();
         if matches!(activity, Activity::Motion | Activity::Other) {
             self.begins_beside(id, &path);
         }

@@ -139,6 +139,8 @@ fn work_ahead_of_time_is_useful_or_wasted() {
     let expected = Speculation { useful: 1, useful_s: 3.0, wasted: 1, wasted_s: 9.0 - 7.3, open: 0 };
     assert_eq!(run(f64::INFINITY), expected);
     assert_eq!((run(7.5).useful, run(7.5).wasted, run(7.5).open), (0, 0, 2));
+    let sequential = lines(&TWO_PLANNERS.replace("\"cdtn\"", "\"hsm\""));
+    assert_eq!(Timeline::of(&sequential).speculation(), Speculation::default());
 }
 
 #[test]
