@@ -311,8 +311,10 @@ impl CellConfig {
             (
                 "session_ttl_ms",
                 self.session_ttl_ms as f64,
-                (500..=600_000).contains(&self.session_ttl_ms),
-                "500 to 600000",
+                // The cell stops by itself when its session is over, and its actions have returned 3 s later.
+                standstill_bound(Duration::from_millis(self.session_ttl_ms)) <= LONGEST_STANDSTILL
+                    && self.session_ttl_ms >= 500,
+                "500 to 57000",
             ),
             (
                 "standstill_ms",
@@ -535,5 +537,10 @@ mod tests {
         );
         let config: CellConfig = toml::from_str("boxes = 10").unwrap();
         assert_eq!(config.check().unwrap_err().to_string(), "`boxes` of the cell is 10: it must be 1 to 9");
+        // The next holder is granted the arm when the cell has stopped by itself, and not before.
+        let with = |ms: u64| toml::from_str::<CellConfig>(&format!("session_ttl_ms = {ms}")).unwrap().check();
+        assert!(with(57_000).is_ok());
+        let refused = with(57_001).unwrap_err().to_string();
+        assert_eq!(refused, "`session_ttl_ms` of the cell is 57001: it must be 500 to 57000");
     }
 }

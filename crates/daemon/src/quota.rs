@@ -42,6 +42,8 @@ pub struct QuotaConfig {
     pub unread_bytes: usize,
     /// Bytes of unread answers to all callers that are not operators.
     pub unread_bytes_of_all: usize,
+    /// A connection whose client takes no part of such answers for so long is closed, in milliseconds.
+    pub unread_ms: u64,
     /// Open connections: a new one replaces the one that has been silent for longest. Has to be below the process's limit of open files.
     pub connections: usize,
     /// New connections per second of one user of this machine or one host; as many as `connections` may come in a burst.
@@ -67,6 +69,7 @@ impl QuotaConfig {
             for_operators: self.connections_for_operators.unwrap_or(self.connections / OPERATORS_PART).max(1),
             first_call: Duration::from_millis(self.first_call_ms),
             idle: Duration::from_millis(self.idle_ms),
+            unread: Duration::from_millis(self.unread_ms),
         }
     }
 }
@@ -80,6 +83,7 @@ impl Default for QuotaConfig {
             watches_of_all: 896,
             unread_bytes: 128 << 20,
             unread_bytes_of_all: 512 << 20,
+            unread_ms: 300_000,
             connections: 768,
             connections_per_s: 200,
             connections_in_use: 512,
@@ -99,6 +103,7 @@ impl Check for QuotaConfig {
         rule("quotas.unread_bytes", holds, "at least 32 MiB: two messages of the greatest length")?;
         let holds = self.unread_bytes_of_all >= self.unread_bytes;
         rule("quotas.unread_bytes_of_all", holds, "at least quotas.unread_bytes")?;
+        rule("quotas.unread_ms", self.unread_ms >= 1_000, "at least 1 s")?;
         rule("quotas.connections", self.connections >= 2, "at least 2")?;
         rule("quotas.connections_per_s", self.connections_per_s >= 1, "at least 1")?;
         rule("quotas.connections_in_use", self.connections_in_use >= 1, "at least 1")?;

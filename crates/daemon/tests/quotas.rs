@@ -114,6 +114,33 @@ async fn answers_that_a_caller_does_not_read_have_a_bound_in_bytes_until_it_read
 }
 
 #[tokio::test]
+async fn a_caller_that_reads_nothing_for_long_makes_room_for_the_others() {
+    let system = TestSystem::new();
+    let quotas = QuotaConfig { unread_bytes: 5 << 20, unread_ms: 500, ..QuotaConfig::default() };
+    let (endpoint, _end) = manager(&system, quotas, Limits::default()).await;
+    let mut client = self::client(&endpoint).await.max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
+    let map = ratn_model::value::Value::String("x".repeat(60_000));
+    ping(&mut client, "maps").await.unwrap();
+    for number in 0..60 {
+        let resource = Resource::new(format!("map-{number:03}"), ResourceClass::Task, "Map");
+        let resource = Some(resource.with_attribute("map", map.clone()).into());
+        let create = v1::CreateRequest { session_id: "maps".to_owned(), resource, ..Default::default() };
+        client.create(create).await.unwrap();
+    }
+    let watch = v1::ResourceServiceWatchRequest { in_parts: true, ..Default::default() };
+    let mut other = self::client(&endpoint).await;
+    let _unread = other.watch(watch.clone()).await.unwrap();
+    refused(client.watch(watch.clone()).await.unwrap_err(), "service.quotas.unread_bytes");
+    // Its connection is open, and it reads nothing.
+    in_time(async {
+        while client.watch(watch.clone()).await.is_err() {
+            tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+        }
+    })
+    .await;
+}
+
+#[tokio::test]
 async fn one_caller_does_not_take_all_watches() {
     let system = TestSystem::new();
     let quotas = QuotaConfig { watches: 20, ..QuotaConfig::default() };

@@ -140,6 +140,8 @@ async fn on_a_full_disk_changes_are_refused_with_what_to_do_and_reading_goes_on(
         let refused = resources.acquire(vec![block("Tool")], AcquireOptions::default()).await.unwrap_err();
         assert!(refused.to_string().contains("free space on this disk"), "{refused}");
     }
+    let recalled = resources.recall(&["take".to_owned()]).await.unwrap_err();
+    assert!(recalled.to_string().contains("free space on this disk"), "{recalled}");
     let ids = async || -> Vec<String> {
         let listed = resources.list(&[]).await.unwrap();
         listed.into_iter().map(|resource| resource.id).collect()

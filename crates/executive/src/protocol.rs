@@ -255,6 +255,10 @@ pub enum Event {
         evidence: Evidence,
         /// Reason, if the outcome is not success; else empty.
         reason: String,
+        /// Whether it is known that nothing moves for it any more: its action has returned, and so have those of the goals that it gave. False in
+        /// logs of earlier versions.
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        at_rest: bool,
     },
     /// The attempt ended without an answer: the worker died, the connection broke, the lease was lost, or the world pool failed.
     Crashed {

@@ -72,6 +72,7 @@ fn finished(instance: InstanceId, attempt: u32) -> Event {
         measured: Vec::new(),
         evidence: Default::default(),
         reason: String::new(),
+        at_rest: true,
     }
 }
 

@@ -162,37 +162,62 @@ impl Model {
         self.quantity(kind) - self.leases.values().map(|(_, units)| units[kind]).sum::<u64>() - self.ending(kind)
     }
 
-    /// Who should be granted now, in order; `ids` are the lease ids that the pool gave them.
+    /// Who should be granted now, in order; `granted` has the lease ids that the pool gave them.
     fn grant(&mut self, granted: &[(WaiterId, LeaseId)]) -> Vec<WaiterId> {
-        self.queue.sort_by_key(|waiter| (-waiter.priority, waiter.id));
-        let mut reserved = Units::default();
         let mut expected = Vec::new();
-        let mut left = Vec::new();
-        for waiter in std::mem::take(&mut self.queue) {
-            let free = |model: &Model, reserved: &Units, kind: usize| model.free(kind).saturating_sub(reserved[kind]);
-            if (0..4).all(|kind| waiter.units[kind] <= free(self, &reserved, kind)) {
-                expected.push(waiter.id);
-                let lease = granted.iter().find(|(id, _)| *id == waiter.id).map_or(LeaseId(0), |(_, lease)| *lease);
-                if waiter.consume {
-                    for kind in 0..4 {
-                        let consumed =
-                            if kind == CHARGE { &mut self.spent } else { &mut self.consumed[waiter.session] };
-                        consumed[kind] += waiter.units[kind];
-                    }
-                }
-                let held = if waiter.consume { Units::default() } else { waiter.units };
-                self.leases.insert(lease, (waiter.session, held));
-                continue;
-            }
-            if (0..4).all(|kind| waiter.units[kind] <= self.quantity(kind)) {
+        // Who is first of its session may change with each grant.
+        while let Some(place) = self.next_served() {
+            let waiter = self.queue.remove(place);
+            expected.push(waiter.id);
+            let lease = granted.iter().find(|(id, _)| *id == waiter.id).map_or(LeaseId(0), |(_, lease)| *lease);
+            if waiter.consume {
                 for kind in 0..4 {
-                    reserved[kind] += waiter.units[kind].min(free(self, &reserved, kind));
+                    let consumed = if kind == CHARGE { &mut self.spent } else { &mut self.consumed[waiter.session] };
+                    consumed[kind] += waiter.units[kind];
                 }
             }
-            left.push(waiter);
+            let held = if waiter.consume { Units::default() } else { waiter.units };
+            self.leases.insert(lease, (waiter.session, held));
         }
-        self.queue = left;
         expected
+    }
+
+    /// The place in the queue of the first one that is served now. What those before it lack and could have is kept for them.
+    fn next_served(&mut self) -> Option<usize> {
+        self.sort();
+        let mut reserved = Units::default();
+        for (place, waiter) in self.queue.iter().enumerate() {
+            let free = |kind: usize| self.free(kind).saturating_sub(reserved[kind]);
+            let takes = [0, 1, 2, 3].map(|kind| waiter.units[kind].min(free(kind)));
+            if takes == waiter.units {
+                return Some(place);
+            }
+            if self.could_have(waiter) {
+                (0..4).for_each(|kind| reserved[kind] += takes[kind]);
+            }
+        }
+        None
+    }
+
+    /// Sorts the queue: the first ones of each session before all others, then by priority and arrival. First is, in the session's own order, who could
+    /// be served and takes nothing of a kind of which an earlier first one takes something.
+    fn sort(&mut self) {
+        let mut queue = std::mem::take(&mut self.queue);
+        queue.sort_by_key(|waiter| (-waiter.priority, waiter.id));
+        let mut taken = [[false; 4]; SESSIONS];
+        let is_first = |waiter: &ModelWaiter| {
+            let (takes, taken) = (waiter.units.map(|units| units > 0), &mut taken[waiter.session]);
+            let first = self.could_have(waiter) && (0..4).all(|kind| !(takes[kind] && taken[kind]));
+            (0..4).for_each(|kind| taken[kind] |= first && takes[kind]);
+            first
+        };
+        let (first, behind): (Vec<_>, Vec<_>) = queue.into_iter().partition(is_first);
+        self.queue = first.into_iter().chain(behind).collect();
+    }
+
+    /// Whether there is as much as it wants, held or not.
+    fn could_have(&self, waiter: &ModelWaiter) -> bool {
+        (0..4).all(|kind| waiter.units[kind] <= self.quantity(kind))
     }
 }
 
@@ -232,140 +257,164 @@ impl Kept {
     }
 }
 
+/// Goes through a history, in the pool and in the model.
+fn history(steps: Vec<Step>) -> Result<(), TestCaseError> {
+    let mut kept = Kept::new();
+    let mut model = Model::default();
+    let mut before_last = model.clone();
+    let names: Vec<SessionId> = ["a", "b", "c"].map(SessionId::from).to_vec();
+    let mut now = 0;
+    for step in steps {
+        if let Step::Wait(time) = step {
+            now += time;
+        }
+        let at = moment(now);
+        if let Step::Crash { snapshot, last_is_lost } = step {
+            let last_is_lost = last_is_lost && !kept.entries.is_empty();
+            kept.crash(at, snapshot, last_is_lost);
+            if last_is_lost {
+                model = before_last.clone();
+            }
+            model.restart(now);
+            compare(&mut kept.pool, &mut model)?;
+            // What is restored is written down already.
+            prop_assert!(kept.pool.take_records().is_empty());
+            before_last = model.clone();
+            kept.snapshots = vec![kept.pool.snapshot().encode()];
+            kept.entries.clear();
+            continue;
+        }
+        let pool = &mut kept.pool;
+        pool.advance(at);
+        model.advance(now);
+        // What became free while time went on is granted before the step.
+        compare(pool, &mut model)?;
+        kept.write();
+        before_last = model.clone();
+        let pool = &mut kept.pool;
+        match step {
+            Step::Wait(_) | Step::Crash { .. } => {}
+            Step::KeepAlive(session) => {
+                let created = pool.keep_alive(at, &names[session], "test", Duration::from_millis(TTL)).unwrap();
+                prop_assert_eq!(created, model.expires[session].is_none());
+                model.expires[session] = Some(now + TTL);
+            }
+            Step::Create(kind, capacity) => {
+                // Several resources of one kind count as their sum.
+                let spec = ResourceSpec::new(ResourceClass::Module, KINDS[kind]);
+                let spec = spec.capacity(Quantity::from_thousandths(capacity));
+                let spec = if kind == ARM { spec.standstill(Duration::from_millis(STANDSTILL)) } else { spec };
+                let spec = if kind == CHARGE { spec.divisible().non_renewable() } else { spec };
+                pool.create(at, None, spec).unwrap();
+                model.capacity[kind] += capacity;
+            }
+            Step::DeleteUnit(kind) => {
+                if model.expires[0].is_some() {
+                    let one = requirement(ResourceOperation::Delete, kind, grain(kind));
+                    let deleted = pool.delete_units(at, &names[0], &one).is_ok();
+                    prop_assert_eq!(deleted, model.free(kind) >= grain(kind));
+                    model.capacity[kind] -= u64::from(deleted) * grain(kind);
+                }
+            }
+            Step::Acquire { session, units, consume, priority, patience } => {
+                let operation = if consume { ResourceOperation::Consume } else { ResourceOperation::Block };
+                let requirements: Vec<Requirement> = (0..4)
+                    .filter(|kind| units[*kind] > 0)
+                    .map(|kind| requirement(operation, kind, units[kind]))
+                    .collect();
+                // Who asks for nothing is refused.
+                let asks = !requirements.is_empty();
+                let mut request = AcquireRequest::new(names[session].clone(), requirements).priority(priority);
+                request.deadline = patience.map(|time| moment(now + time));
+                let result = pool.acquire(at, request);
+                let deadline = patience.map(|time| now + time);
+                // Behind all of its priority, as the pool numbers it.
+                let id = WaiterId(u64::MAX);
+                let waiter = ModelWaiter { id, session, units, consume, priority, deadline };
+                let of_session = model.queue.iter().filter(|waiter| waiter.session == session).count();
+                let full = model.queue.len() >= WAITERS || of_session >= WAITERS_OF_ONE;
+                let waits = || {
+                    let mut model = model.clone();
+                    model.queue.push(waiter.clone());
+                    !model.grant(&[]).contains(&id)
+                };
+                let welcome = asks && model.expires[session].is_some() && !(full && waits());
+                prop_assert_eq!(result.is_ok(), welcome, "full: {}", full);
+                if let Ok(id) = result {
+                    model.queue.push(ModelWaiter { id, ..waiter });
+                }
+            }
+            Step::Release(index) => {
+                if let Some((lease, (session, _))) = model.leases.iter().nth(index).map(|(id, lease)| (*id, *lease)) {
+                    pool.release(at, Some(&names[session]), lease).unwrap();
+                    model.leases.remove(&lease);
+                }
+            }
+            Step::Revoke(index) => {
+                if let Some((lease, (session, _))) = model.leases.iter().nth(index).map(|(id, lease)| (*id, *lease)) {
+                    // By another, or by a holder that does not know whether something still moves.
+                    match index % 2 {
+                        0 => pool.release(at, None, lease).unwrap(),
+                        _ => pool.release_moving(at, Some(&names[session]), lease).unwrap(),
+                    }
+                    model.revoke(lease, now);
+                }
+            }
+            Step::ConfirmStandstill(index) => {
+                // Of one that lives nothing is to be confirmed.
+                for (lease, resource) in model.leases.keys().zip(pool.list()) {
+                    prop_assert!(!pool.confirm_standstill(at, None, *lease, &resource.id).unwrap());
+                }
+                if let Some(lease) = model.ending.keys().nth(index).copied() {
+                    let left = pool
+                        .list()
+                        .into_iter()
+                        .filter(|view| view.holders.ending().any(|ending| ending.lease == lease));
+                    for resource in left.collect::<Vec<_>>() {
+                        prop_assert!(pool.confirm_standstill(at, None, lease, &resource.id).unwrap());
+                        prop_assert!(!pool.confirm_standstill(at, None, lease, &resource.id).unwrap());
+                    }
+                    model.ending.remove(&lease);
+                }
+            }
+            Step::Cancel(index) => {
+                if index < model.queue.len() {
+                    pool.cancel(at, model.queue.remove(index).id).unwrap();
+                }
+            }
+            Step::EndTask(session) => {
+                let known = pool.end_task(at, &names[session]).is_ok();
+                prop_assert_eq!(known, model.expires[session].is_some());
+                model.consumed[session] = Units::default();
+            }
+        }
+        compare(pool, &mut model)?;
+        kept.write();
+    }
+    Ok(())
+}
+
+#[test]
+fn the_second_request_of_a_session_comes_behind_the_first_of_another_whatever_its_priority() {
+    let acquire = |session, [arms, planners]: [u64; 2], priority| {
+        let units = [arms * UNIT, 0, planners * UNIT, 0];
+        Step::Acquire { session, units, consume: false, priority, patience: None }
+    };
+    let planner = 2;
+    let mut steps = vec![Step::Create(ARM, UNIT), Step::Create(ARM, 2 * UNIT), Step::Create(planner, 2 * UNIT)];
+    steps.extend((0..SESSIONS).map(Step::KeepAlive));
+    // One planner is held. The first session waits for the other one, too, with an arm; the second one waits for a planner with an arm; and what is left
+    // are fewer arms than the first one wants besides.
+    steps.extend([acquire(2, [0, 1], 0), acquire(0, [1, 2], 1), acquire(1, [1, 1], 0), acquire(0, [2, 0], 1)]);
+    history(steps).unwrap();
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 400, ..ProptestConfig::default() })]
 
     #[test]
     fn every_history_grants_what_the_obvious_model_grants(steps in prop::collection::vec(step(), 1..80)) {
-        let mut kept = Kept::new();
-        let mut model = Model::default();
-        let mut before_last = model.clone();
-        let names: Vec<SessionId> = ["a", "b", "c"].map(SessionId::from).to_vec();
-        let mut now = 0;
-        for step in steps {
-            if let Step::Wait(time) = step {
-                now += time;
-            }
-            let at = moment(now);
-            if let Step::Crash { snapshot, last_is_lost } = step {
-                let last_is_lost = last_is_lost && !kept.entries.is_empty();
-                kept.crash(at, snapshot, last_is_lost);
-                if last_is_lost {
-                    model = before_last.clone();
-                }
-                model.restart(now);
-                compare(&mut kept.pool, &mut model)?;
-                // What is restored is written down already.
-                prop_assert!(kept.pool.take_records().is_empty());
-                before_last = model.clone();
-                kept.snapshots = vec![kept.pool.snapshot().encode()];
-                kept.entries.clear();
-                continue;
-            }
-            let pool = &mut kept.pool;
-            pool.advance(at);
-            model.advance(now);
-            // What became free while time went on is granted before the step.
-            compare(pool, &mut model)?;
-            kept.write();
-            before_last = model.clone();
-            let pool = &mut kept.pool;
-            match step {
-                Step::Wait(_) | Step::Crash { .. } => {}
-                Step::KeepAlive(session) => {
-                    let created = pool.keep_alive(at, &names[session], "test", Duration::from_millis(TTL)).unwrap();
-                    prop_assert_eq!(created, model.expires[session].is_none());
-                    model.expires[session] = Some(now + TTL);
-                }
-                Step::Create(kind, capacity) => {
-                    // Several resources of one kind count as their sum.
-                    let spec = ResourceSpec::new(ResourceClass::Module, KINDS[kind]);
-                    let spec = spec.capacity(Quantity::from_thousandths(capacity));
-                    let spec = if kind == ARM { spec.standstill(Duration::from_millis(STANDSTILL)) } else { spec };
-                    let spec = if kind == CHARGE { spec.divisible().non_renewable() } else { spec };
-                    pool.create(at, None, spec).unwrap();
-                    model.capacity[kind] += capacity;
-                }
-                Step::DeleteUnit(kind) => {
-                    if model.expires[0].is_some() {
-                        let one = requirement(ResourceOperation::Delete, kind, grain(kind));
-                        let deleted = pool.delete_units(at, &names[0], &one).is_ok();
-                        prop_assert_eq!(deleted, model.free(kind) >= grain(kind));
-                        model.capacity[kind] -= u64::from(deleted) * grain(kind);
-                    }
-                }
-                Step::Acquire { session, units, consume, priority, patience } => {
-                    let operation = if consume { ResourceOperation::Consume } else { ResourceOperation::Block };
-                    let requirements: Vec<Requirement> = (0..4)
-                        .filter(|kind| units[*kind] > 0)
-                        .map(|kind| requirement(operation, kind, units[kind]))
-                        .collect();
-                    // Who asks for nothing is refused.
-                    let asks = !requirements.is_empty();
-                    let mut request = AcquireRequest::new(names[session].clone(), requirements).priority(priority);
-                    request.deadline = patience.map(|time| moment(now + time));
-                    let result = pool.acquire(at, request);
-                    let deadline = patience.map(|time| now + time);
-                    // Behind all of its priority, as the pool numbers it.
-                    let id = WaiterId(u64::MAX);
-                    let waiter = ModelWaiter { id, session, units, consume, priority, deadline };
-                    let of_session = model.queue.iter().filter(|waiter| waiter.session == session).count();
-                    let full = model.queue.len() >= WAITERS || of_session >= WAITERS_OF_ONE;
-                    let waits = || {
-                        let mut model = model.clone();
-                        model.queue.push(waiter.clone());
-                        !model.grant(&[]).contains(&id)
-                    };
-                    let welcome = asks && model.expires[session].is_some() && !(full && waits());
-                    prop_assert_eq!(result.is_ok(), welcome, "full: {}", full);
-                    if let Ok(id) = result {
-                        model.queue.push(ModelWaiter { id, ..waiter });
-                    }
-                }
-                Step::Release(index) => {
-                    if let Some((lease, (session, _))) = model.leases.iter().nth(index).map(|(id, lease)| (*id, *lease)) {
-                        pool.release(at, Some(&names[session]), lease).unwrap();
-                        model.leases.remove(&lease);
-                    }
-                }
-                Step::Revoke(index) => {
-                    if let Some((lease, (session, _))) = model.leases.iter().nth(index).map(|(id, lease)| (*id, *lease)) {
-                        // By another, or by a holder that does not know whether something still moves.
-                        match index % 2 {
-                            0 => pool.release(at, None, lease).unwrap(),
-                            _ => pool.release_moving(at, Some(&names[session]), lease).unwrap(),
-                        }
-                        model.revoke(lease, now);
-                    }
-                }
-                Step::ConfirmStandstill(index) => {
-                    // Of one that lives nothing is to be confirmed.
-                    for (lease, resource) in model.leases.keys().zip(pool.list()) {
-                        prop_assert!(!pool.confirm_standstill(at, None, *lease, &resource.id).unwrap());
-                    }
-                    if let Some(lease) = model.ending.keys().nth(index).copied() {
-                        let left = pool.list().into_iter().filter(|view| view.holders.ending().any(|ending| ending.lease == lease));
-                        for resource in left.collect::<Vec<_>>() {
-                            prop_assert!(pool.confirm_standstill(at, None, lease, &resource.id).unwrap());
-                            prop_assert!(!pool.confirm_standstill(at, None, lease, &resource.id).unwrap());
-                        }
-                        model.ending.remove(&lease);
-                    }
-                }
-                Step::Cancel(index) => {
-                    if index < model.queue.len() {
-                        pool.cancel(at, model.queue.remove(index).id).unwrap();
-                    }
-                }
-                Step::EndTask(session) => {
-                    let known = pool.end_task(at, &names[session]).is_ok();
-                    prop_assert_eq!(known, model.expires[session].is_some());
-                    model.consumed[session] = Units::default();
-                }
-            }
-            compare(pool, &mut model)?;
-            kept.write();
-        }
+        history(steps)?;
     }
 
     #[test]

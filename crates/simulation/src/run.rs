@@ -685,8 +685,8 @@ impl Simulation<'_> {
         let event = match answer {
             Answer::Finished { outcome, outputs, measured } => {
                 let reason = if outcome == "success" { String::new() } else { format!("the oracle says {outcome}") };
-                let evidence = Vec::new();
-                Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason }
+                let (evidence, at_rest) = (Vec::new(), true);
+                Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason, at_rest }
             }
             Answer::Crashed => Event::Crashed {
                 instance,

@@ -406,8 +406,8 @@ impl System<'_> {
                 let Performance { duration_s, answer } = self.oracle.perform(&path, attempt, &goal, world);
                 let event = match answer {
                     Answer::Finished { outcome, outputs, measured } => {
-                        let (evidence, reason) = Default::default();
-                        Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason }
+                        let (evidence, reason, at_rest) = (Vec::new(), String::new(), true);
+                        Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason, at_rest }
                     }
                     Answer::Crashed | Answer::LeaseLost => Event::Crashed {
                         instance,

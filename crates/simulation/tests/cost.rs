@@ -166,6 +166,7 @@ impl Shell {
             measured: if &*goal.provider == "arm" { self.measured.clone() } else { Vec::new() },
             evidence: Vec::new(),
             reason: String::new(),
+            at_rest: true,
         }
     }
 

@@ -84,6 +84,7 @@ impl Begun {
             measured: Vec::new(),
             evidence: Vec::new(),
             reason: String::new(),
+            at_rest: true,
         };
         self.handle(at_s, event);
     }

@@ -247,6 +247,7 @@ impl Bench {
             measured: Vec::new(),
             evidence: Vec::new(),
             reason: String::new(),
+            at_rest: true,
         });
     }
 
@@ -558,6 +559,7 @@ fn a_state_that_fails_without_a_reason_is_named_in_both_modes() {
             measured: Vec::new(),
             evidence: Vec::new(),
             reason: String::new(),
+            at_rest: true,
         });
         let reason = bench.commands.into_iter().find_map(|command| match command {
             Command::End { reason, .. } => Some(reason),
@@ -610,6 +612,7 @@ fn what_was_measured_is_committed_with_who_wrote_it_and_how_sure_it_is() {
             measured: vec![(cup("seen"), Value::Int(3))],
             evidence: evidence.clone(),
             reason: String::new(),
+            at_rest: true,
         });
         let committed = std::mem::take(&mut bench.commands).into_iter().filter_map(|command| match command {
             Command::Commit { writer, changes, evidence, .. } => Some((writer, changes.len(), evidence)),

@@ -64,7 +64,10 @@ pub(super) struct Ledger {
     pub(super) held: BTreeSet<LeaseId>,
     /// The last leases that the run was about to give back. Whether it did is unknown.
     pub(super) returned: Vec<LeaseId>,
-    /// The leases among them that were to be given back while a commit was unconfirmed.
+    /// The leases under which a goal has ended of which the log does not say that nothing moves for it any more. Goals that a resumption looks for
+    /// again (`goals`, `stopped`) say it themselves.
+    pub(super) doubtful: BTreeSet<LeaseId>,
+    /// The leases among the returned ones that were to be given back while a commit was unconfirmed.
     pub(super) went_back: Vec<WentBack>,
     /// What the run has created and used up in its session.
     pub(super) account: Account,
@@ -226,8 +229,11 @@ impl Ledger {
                 self.stops(*instance, *attempt);
                 self.projecting.retain(|id, asked| id != instance || asked.attempt != *attempt);
             }
-            Event::Finished { instance, attempt, .. } => {
-                self.goals.retain(|id, goal| id != instance || goal.0 != *attempt);
+            Event::Finished { instance, attempt, at_rest, .. } => {
+                let is_meant = |id: &InstanceId, goal: &mut (u32, Goal)| id == instance && goal.0 == *attempt;
+                for (_, (_, goal)) in self.goals.extract_if(.., is_meant) {
+                    self.doubtful.extend(goal.lease.filter(|_| !at_rest).map(|lease| lease.id));
+                }
                 self.projecting.retain(|id, asked| id != instance || asked.attempt != *attempt);
             }
             _ => {}
@@ -348,7 +354,8 @@ impl Ledger {
         let is_meant = self.goals.get(&instance).is_some_and(|goal| goal.0 == attempt);
         if let Some((_, goal)) = is_meant.then(|| self.goals.remove(&instance)).flatten() {
             self.stopped.push((instance, attempt, goal));
-            self.stopped.drain(..self.stopped.len().saturating_sub(KEPT_STOPPED));
+            let old = self.stopped.drain(..self.stopped.len().saturating_sub(KEPT_STOPPED));
+            self.doubtful.extend(old.filter_map(|(_, _, goal)| goal.lease).map(|lease| lease.id));
         }
     }
 
@@ -364,7 +371,7 @@ impl Ledger {
         self.commits.drain(..commits);
         self.forgotten += commits as u64;
         self.went_back.retain(|one| one.decided > confirmed.commit);
-
+        self.doubtful.retain(|lease| self.held.contains(lease) || self.returned.contains(lease));
         self.withdrawn.drain(..self.withdrawn.len().saturating_sub(KEPT_WITHDRAWN));
     }
 }

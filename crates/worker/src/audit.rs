@@ -31,7 +31,7 @@ pub enum Mutation {
     Delete { session: String, target: String },
     Acquire { session: String, requirements: Vec<String>, holder: String, priority: i64 },
     Withdraw { session: String },
-    Release { session: String, lease: u64 },
+    Release { session: String, lease: u64, at_rest: bool },
     ConfirmStandstill { session: String, lease: u64, resource: String },
     EndTask { session: String },
     ReportShortage { session: String, kind: String, most: u32, reason: String },

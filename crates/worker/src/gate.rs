@@ -253,13 +253,16 @@ where
             };
             let (head, body) = answer.into_parts();
             let code = code_of(&head.headers);
-            let (answer, code) = match Answer::begin(body, held).await {
-                Ok(answer) => (http::Response::from_parts(head, Body::new(answer)), code),
-                Err(refused) => (refused.clone().into_http(), refused.code()),
-            };
+            let answer = Answer::begin(body, held).await;
+            let refused = answer.refusal().cloned();
+            let code = refused.as_ref().map_or(code, Status::code);
             gate.answered(path.path(), code, began.elapsed());
             ended_with(code);
-            Ok(answer)
+            Ok(match refused {
+                // On a stream of many calls some may be under way: it has been opened, and ends.
+                Some(refused) if !CARRIERS.contains(&path.path()) => refused.into_http(),
+                _ => http::Response::from_parts(head, Body::new(answer)),
+            })
         };
         match own {
             None => Box::pin(answered),
@@ -295,7 +298,7 @@ fn admit(gate: &Arc<dyn Gate>, calls: &Calls, request: &mut http::Request<Body>)
     };
     let call = calls.begin(counted)?;
     let revocation = changes.map(|changes| Revocation::new(gate.clone(), changes, identity, caller.clone(), path));
-    let unread = Unread::of(gate.clone(), caller.clone());
+    let unread = Unread::of(gate.clone(), caller.clone(), link_of(request.extensions()).cloned());
     request.extensions_mut().insert(caller);
     Ok(Held { _call: call, _permit: permit, _in_use: in_use, revocation, unread })
 }

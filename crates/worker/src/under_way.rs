@@ -5,14 +5,14 @@
 //!   admitted ──▶ performed ──▶ answered ──▶ over
 //!                    └──────────────┴─ roles have changed, Caller::goes_on refuses ──▶ dropped; the caller gets the refusal
 //! ```
-//! The part of an answer that the connection has not taken yet counts for its caller ([`Gate::unread`]). An answer whose first part is
-//! ready is encoded at once, so that the number of waiting bytes is known.
+//! The part of an answer that the connection has not taken yet counts for its caller ([`Gate::unread`]), and the connection is closed if its client
+//! takes none for long. An answer whose first part is ready is encoded at once, so that the number of waiting bytes is known.
 //!
 //! A call that is dropped because of a lost permission ends as if its client had gone away: an acquire leaves the queue, a goal has its
 //! grace.
 
 use crate::access::Caller;
-use crate::connections::InUse;
+use crate::connections::{InUse, Link, Waits};
 use crate::gate::{Gate, Identity, Permit};
 use bytes::Bytes;
 use http_body::{Body as _, Frame, SizeHint};
@@ -35,15 +35,16 @@ pub(crate) struct Held {
     pub(crate) unread: Unread,
 }
 
-/// The caller whose answer waits to be read, and the gate that counts its bytes.
+/// The caller whose answer waits to be read, its connection, and the gate that counts its bytes.
 pub(crate) struct Unread {
     gate: Arc<dyn Gate>,
     caller: Caller,
+    link: Option<Link>,
 }
 
 impl Unread {
-    pub(crate) fn of(gate: Arc<dyn Gate>, caller: Caller) -> Unread {
-        Unread { gate, caller }
+    pub(crate) fn of(gate: Arc<dyn Gate>, caller: Caller, link: Option<Link>) -> Unread {
+        Unread { gate, caller, link }
     }
 
     /// Counts a part of the answer until the connection has written all of it.
@@ -55,7 +56,10 @@ impl Unread {
         };
         Ok(Frame::data(match self.gate.unread(&self.caller, bytes.len())? {
             None => bytes,
-            Some(permit) => Bytes::from_owner(Counted { bytes, _permit: permit }),
+            Some(permit) => {
+                let waits = self.link.as_ref().map(Link::waits);
+                Bytes::from_owner(Counted { bytes, _permit: permit, _waits: waits })
+            }
         }))
     }
 }
@@ -64,6 +68,7 @@ impl Unread {
 struct Counted {
     bytes: Bytes,
     _permit: Permit,
+    _waits: Option<Waits>,
 }
 
 impl AsRef<[u8]> for Counted {
@@ -117,28 +122,38 @@ pub(crate) struct Answer {
     body: Body,
     /// The part that was encoded before the connection asked for any.
     first: Option<Result<Frame<Bytes>, Status>>,
+    /// Ends the answer in place of its first part.
+    refused: Option<Status>,
     /// `None` after the call was ended early.
     held: Option<Held>,
 }
 
 impl Answer {
-    /// Begins an answer; if its first part is ready, the part is encoded.
-    pub(crate) async fn begin(mut body: Body, held: Held) -> Result<Answer, Status> {
+    /// Begins an answer; if its first part is ready, the part is encoded. An answer whose first part is refused ends with the refusal.
+    pub(crate) async fn begin(mut body: Body, held: Held) -> Answer {
         let first = std::future::poll_fn(|context| match Pin::new(&mut body).poll_frame(context) {
             Poll::Ready(first) => Poll::Ready(Some(first)),
             Poll::Pending => Poll::Ready(None),
         });
-        let first = match first.await {
-            Some(Some(Ok(first))) => Some(Ok(held.unread.counted(first)?)),
-            Some(Some(Err(error))) => Some(Err(error)),
+        let (first, refused) = match first.await {
+            Some(Some(Ok(first))) => match held.unread.counted(first) {
+                Ok(first) => (Some(Ok(first)), None),
+                Err(refused) => (None, Some(refused)),
+            },
+            Some(Some(Err(error))) => (Some(Err(error)), None),
             // The body is empty, and is not polled again.
             Some(None) => {
                 body = Body::empty();
-                None
+                (None, None)
             }
-            None => None,
+            None => (None, None),
         };
-        Ok(Answer { body, first, held: Some(held) })
+        Answer { body, first, refused, held: Some(held) }
+    }
+
+    /// The refusal of its first part.
+    pub(crate) fn refusal(&self) -> Option<&Status> {
+        self.refused.as_ref()
     }
 
     /// Ends the answer with this status.
@@ -158,6 +173,9 @@ impl http_body::Body for Answer {
         if let Some(Poll::Ready(lost)) = held.revocation.as_mut().map(|revocation| revocation.poll_lost(context)) {
             return self.end(&lost);
         }
+        if let Some(refused) = self.refused.take() {
+            return self.end(&refused);
+        }
         if let Some(first) = self.first.take() {
             return Poll::Ready(Some(first));
         }
@@ -173,10 +191,10 @@ impl http_body::Body for Answer {
     }
 
     fn is_end_stream(&self) -> bool {
-        self.held.is_none() || (self.first.is_none() && self.body.is_end_stream())
+        self.held.is_none() || (self.first.is_none() && self.refused.is_none() && self.body.is_end_stream())
     }
 
     fn size_hint(&self) -> SizeHint {
-        if self.first.is_none() { self.body.size_hint() } else { SizeHint::default() }
+        if self.first.is_none() && self.refused.is_none() { self.body.size_hint() } else { SizeHint::default() }
     }
 }

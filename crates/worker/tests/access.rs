@@ -6,9 +6,9 @@ mod common;
 use common::{Double, RESOURCE, goal};
 use ratn_model::id::{FencingToken, LeaseId, Revision};
 use ratn_model::resource::{Quantity, ResourceClass};
-use ratn_proto::types::{Holding, Resource, ResourceUpdate};
+use ratn_proto::types::{GoalOutcome, Holding, Resource, ResourceUpdate};
 use ratn_worker::access::{AccessConfig, LiveAccess, Role, RoleGate, UserAccess};
-use ratn_worker::action::ActionServer;
+use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
 use ratn_worker::client::{ActionClient, Channels};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::lease_watch::LeaseWatch;
@@ -181,5 +181,54 @@ async fn a_stream_of_a_server_that_follows_a_file_ends_though_nobody_calls() {
     write("");
     let ended = tokio::time::timeout(Duration::from_secs(60), stream.message()).await.expect("the stream ends");
     assert_eq!(ended.unwrap_err().code(), Code::PermissionDenied);
+    shutdown.cancel();
+}
+
+/// Moves until it is told to stop, for as long as that takes.
+struct Moves(tokio::sync::watch::Sender<bool>);
+
+#[tonic::async_trait]
+impl Action for Moves {
+    fn name(&self) -> &str {
+        "moves"
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        self.0.send_replace(true);
+        goal.cancelled.cancelled().await;
+        tokio::time::sleep(Duration::from_millis(300)).await;
+        self.0.send_replace(false);
+        Ok(GoalOutcome::success())
+    }
+}
+
+#[tokio::test]
+async fn a_goal_whose_giver_loses_its_role_was_not_refused_but_is_under_way() {
+    let place = tempfile::tempdir().unwrap();
+    let (moves, mut moving) = tokio::sync::watch::channel(false);
+    let server = ActionServer::builder(RESOURCE).dangerously_believe_every_lease().action(Moves(moves)).build();
+    let bound = bind(&Endpoint::Unix(place.path().join("one.sock"))).await.unwrap();
+    let (endpoint, live) = (bound.endpoint().clone(), LiveAccess::new(only(&[Role::Task])));
+    let serving = Serving { gate: Arc::new(RoleGate::new(live.clone())), ..Serving::default() };
+    let shutdown = CancellationToken::new();
+    tokio::spawn(bound.serve_as(Services::new().with(server.into_service()), serving, shutdown.clone()));
+    let client = ActionClient::new(Channels::new(&ClientTls::none()));
+    // Once over the stream that goals share, and once over one of its own.
+    for (number, now) in [(1, &[Role::Viewer] as &[Role]), (2, &[])] {
+        live.replace(only(&[Role::Task]));
+        let goal = goal(&format!("g{number}"), "moves", number);
+        let (giver, at, again) = (client.clone(), endpoint.clone(), goal.clone());
+        let given = tokio::spawn(async move { giver.execute_hearing(&at, goal, || true, |_| {}).await });
+        moving.wait_for(|moving| *moving).await.unwrap();
+        let (joiner, at) = (client.clone(), endpoint.clone());
+        let joined = tokio::spawn(async move { joiner.attach(&at, again, |_, _| {}).await });
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        live.replace(only(now));
+        for ended in [given.await.unwrap(), joined.await.unwrap()] {
+            let error = ended.unwrap_err();
+            assert!(error.is_crash() && error.to_string().contains("may not Perform"), "{error}");
+        }
+        moving.wait_for(|moving| !*moving).await.unwrap();
+    }
     shutdown.cancel();
 }

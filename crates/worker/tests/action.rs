@@ -175,6 +175,9 @@ async fn a_wrong_input_and_a_panic_end_the_goal_aborted_with_the_reason() {
     assert_eq!(outcome, GoalOutcome::aborted("input `x` of `double` is a string: expected a number"));
     let outcome = run(&provider, goal("b", "panic", 1)).await.unwrap();
     assert_eq!(outcome, GoalOutcome::aborted("the action panicked: on purpose"));
+    // What it moved may still move.
+    let performed = provider.client.execute_hearing(&provider.endpoint, goal("c", "panic", 1), || true, |_| {});
+    assert!(performed.await.unwrap().may_move);
 }
 
 #[tokio::test]

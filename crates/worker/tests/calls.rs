@@ -11,8 +11,10 @@ use ratn_worker::endpoint::Endpoint;
 use ratn_worker::server::{Services, bind};
 use ratn_worker::tls::ClientTls;
 use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
+use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::{Notify, Semaphore, watch};
 use tokio::task::JoinHandle;
 use tokio_util::sync::{CancellationToken, DropGuard};
@@ -89,7 +91,35 @@ struct Bench {
     may_stand: Arc<Semaphore>,
     leaves: Arc<Notify>,
     _shutdown: DropGuard,
-    _place: tempfile::TempDir,
+    place: tempfile::TempDir,
+}
+
+/// Connections that were accepted, and the moments at which all of them are cut.
+struct Line {
+    accepted: watch::Receiver<usize>,
+    cut: Arc<Notify>,
+}
+
+impl Line {
+    /// Passes on what comes at `from`.
+    fn new(from: &Path, to: PathBuf) -> Line {
+        let (listener, cut) = (UnixListener::bind(from).unwrap(), Arc::new(Notify::new()));
+        let (count, accepted) = watch::channel(0);
+        let cuts = Arc::clone(&cut);
+        tokio::spawn(async move {
+            while let Ok((mut near, _)) = listener.accept().await {
+                let (mut far, cut) = (UnixStream::connect(&to).await.unwrap(), Arc::clone(&cuts));
+                tokio::spawn(async move {
+                    tokio::select! {
+                        _ = tokio::io::copy_bidirectional(&mut near, &mut far) => {}
+                        () = cut.notified() => {}
+                    }
+                });
+                count.send_modify(|count| *count += 1);
+            }
+        });
+        Line { accepted, cut }
+    }
 }
 
 impl Bench {
@@ -117,7 +147,7 @@ impl Bench {
             may_stand,
             leaves,
             _shutdown: shutdown.drop_guard(),
-            _place: place,
+            place,
         }
     }
 
@@ -178,4 +208,21 @@ async fn a_goal_whose_call_was_lost_says_that_something_may_still_move() {
     bench.arm = Endpoint::Unix("/nowhere/arm.sock".into());
     let fate = bench.give("pick").await.unwrap();
     assert_eq!((fate.outcome.outcome.as_str(), fate.may_move), ("aborted", true));
+}
+
+#[tokio::test]
+async fn a_motion_whose_connection_breaks_goes_on_and_its_end_is_heard() {
+    let mut bench = Bench::new().await;
+    let near = bench.place.path().join("line");
+    let mut line = Line::new(&near, bench.place.path().join("arm"));
+    bench.arm = Endpoint::Unix(near);
+    let ended = bench.begin("pick").await;
+    let before = *line.accepted.borrow();
+    line.cut.notify_waiters();
+    line.accepted.wait_for(|accepted| *accepted > before).await.unwrap();
+    tokio::time::sleep(Duration::from_millis(50)).await;
+    assert_eq!(*bench.does.borrow(), Arm::Moves);
+    assert!(bench.client.cancel(&bench.picker, "pick").await.unwrap());
+    let fate = bench.is_over_when_the_arm_stands(ended).await;
+    assert_eq!((fate.outcome.outcome.as_str(), fate.may_move), ("aborted", false));
 }

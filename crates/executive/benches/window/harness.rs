@@ -171,6 +171,7 @@ fn ended(
         measured,
         evidence: Vec::new(),
         reason: String::new(),
+        at_rest: true,
     }
 }
 

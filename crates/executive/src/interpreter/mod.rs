@@ -414,7 +414,7 @@ impl Interpreter {
                     self.crashed(context, thread, &reason, (unknown, refused));
                 }
             }
-            Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason } => {
+            Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason, .. } => {
                 if let Some(thread) = of(self, instance, Some(attempt))
                     && self.phase(thread) == Some(Phase::Running)
                 {

@@ -15,7 +15,7 @@ use std::path::Path;
 /// The first bytes of every checkpoint file.
 const MAGIC: &[u8; 16] = b"ratn checkpoint\n";
 /// The format version. Other versions are not read.
-const FORMAT: u32 = 8;
+const FORMAT: u32 = 9;
 /// Number of bytes before the rest: magic number, format version, length and digest.
 const PREAMBLE: usize = MAGIC.len() + 4 + 8 + blake3::OUT_LEN;
 /// A run with a larger state has no checkpoints.

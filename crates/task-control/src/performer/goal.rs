@@ -134,34 +134,46 @@ pub(super) fn deadline_ms(timeout_s: Option<f64>, speed: f64) -> u64 {
 impl Performing {
     /// Performs the goal until its end; sends the event to the shell, unless the goal was cancelled.
     pub(super) async fn perform(mut self, given: Given) {
-        if let Some(safe) = self.safe.take() {
-            tokio::select! {
-                biased;
-                () = self.stop.cancelled() => return,
-                () = self.over.cancelled() => return,
-                // If it never will be, the run ends.
-                is_safe = safe.safe() => if !is_safe { return },
-            }
-        }
-        // A goal that was given before is looked for first.
-        if given == Given::Now && !(self.is_its_turn().await && self.sees_what_was_decided().await) {
-            return;
-        }
-        if given != Given::ToStop && self.stop.is_cancelled() || self.over.is_cancelled() {
-            return;
-        }
-        let event = match &self.endpoint {
-            Ok(endpoint) => self.execute(endpoint, given).await,
-            Err(reason) => Some(self.aborted(reason.clone())),
-        };
-        // Whoever gives the lease back says so.
-        if self.may_move.load(Ordering::Acquire) {
+        // One that was given before may be under way, whether or not it is found.
+        self.may_move.store(given != Given::Now, Ordering::Release);
+        let mut event = self.ended(given).await;
+        // Whoever gives the lease back says so, also after a resumption.
+        let may_move = self.may_move.load(Ordering::Acquire);
+        if may_move {
             self.doubtful.add(self.goal.lease.as_ref().map(|lease| lease.id));
+        }
+        if let Some(Event::Finished { at_rest, .. }) = &mut event {
+            *at_rest = !may_move;
         }
         if let Some(event) = event
             && !self.stop.is_cancelled()
         {
             let _ = self.events.send(event.into()).await;
+        }
+    }
+
+    /// The end of the goal; `None` if it was cancelled.
+    async fn ended(&mut self, given: Given) -> Option<Event> {
+        if let Some(safe) = self.safe.take() {
+            tokio::select! {
+                biased;
+                () = self.stop.cancelled() => return None,
+                () = self.over.cancelled() => return None,
+                // If it never will be, the run ends.
+                is_safe = safe.safe() => if !is_safe { return None },
+            }
+        }
+        // A goal that was given before is looked for first.
+        if given == Given::Now && !(self.is_its_turn().await && self.sees_what_was_decided().await) {
+            return None;
+        }
+        // One that was given before has to hear that it is cancelled.
+        if given == Given::Now && self.stop.is_cancelled() || self.over.is_cancelled() {
+            return None;
+        }
+        match &self.endpoint {
+            Ok(endpoint) => self.execute(endpoint, given).await,
+            Err(reason) => Some(self.aborted(reason.clone())),
         }
     }
 
@@ -477,6 +489,7 @@ impl Performing {
             outputs: done.outputs,
             measured: done.measured,
             reason: readable(&done.reason),
+            at_rest: false,
         }
     }
 

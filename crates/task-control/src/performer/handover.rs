@@ -182,6 +182,7 @@ mod tests {
             measured: Vec::new(),
             evidence: Vec::new(),
             reason: String::new(),
+            at_rest: true,
         }
     }
 

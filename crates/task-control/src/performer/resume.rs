@@ -412,11 +412,12 @@ impl Performer {
         over
     }
 
-    /// Gives back the leases that the session holds and the run does not, as such for which something may still move: those that it was about to give back, with a note about its commits; and,
-    /// after the withdrawals (which also return what was used up), grants that nobody heard of. Notes of earlier holders stay at the resources.
+    /// Gives back the leases that the session holds and the run does not: those that it was about to give back, with a note about its commits, and at
+    /// rest if that is known of all goals under them; and, after the withdrawals (which also return what was used up), grants that nobody heard of, as
+    /// such for which something may still move. Notes of earlier holders stay at the resources.
     async fn sweep(&mut self, ledger: &Ledger, withdrawn: CancellationToken) -> anyhow::Result<()> {
-        // How all goals under them have ended that were given before is not known.
-        self.goals.doubtful.add(ledger.held.iter().copied());
+        // Of goals that are looked for again it is known when their end is heard.
+        self.goals.doubtful.add(ledger.doubtful.iter().copied());
         let living = living_leases(&self.resources, &self.run).await?;
         let (known, unheard): (Vec<LeaseId>, BTreeSet<LeaseId>) = {
             let is_known = |lease: &&LeaseId| ledger.returned.contains(lease);
@@ -428,11 +429,12 @@ impl Performer {
             let note = self.told.left(self.decided).to_string();
             self.left.goes_back(self.decided, self.confirmed().commit, Instant::now());
             let (idle, returns) = (self.goals.under(lease), self.order.returning.begin());
+            let doubtful = self.goals.doubtful.clone();
             self.giving_back.spawn(async move {
                 for goal in idle {
                     goal.cancelled().await;
                 }
-                release(&resources, &trust, lease, &note).await;
+                release(&resources, &trust, lease, &note, doubtful.goes_back_at_rest(lease)).await;
                 drop(returns);
             });
         }
@@ -446,7 +448,8 @@ impl Performer {
             match living_leases(&resources, &run).await {
                 Ok(living) => {
                     for lease in unheard.intersection(&living) {
-                        release(&resources, &trust, *lease, "").await;
+                        // What was begun under it is not known.
+                        release(&resources, &trust, *lease, "", false).await;
                     }
                 }
                 Err(error) => tracing::warn!("leases that nobody heard of were not given back: {error:#}"),
@@ -482,9 +485,8 @@ async fn living_leases(resources: &ResourceClient, run: &str) -> anyhow::Result<
     Ok(resources.into_iter().flat_map(own).collect())
 }
 
-async fn release(resources: &ResourceClient, trust: &Trust, lease: LeaseId, note: &str) {
-    // What was begun under it before is not known.
-    let release = || resources.release_with_note(lease, note.to_owned(), false);
+async fn release(resources: &ResourceClient, trust: &Trust, lease: LeaseId, note: &str, at_rest: bool) {
+    let release = || resources.release_with_note(lease, note.to_owned(), at_rest);
     if let Err(undone) = insist(trust, Unanswered::Waits, release).await {
         tracing::warn!("a lease that was left from before was not given back: {undone}");
     }

@@ -11,7 +11,7 @@
 
 use super::authority::{Authority, Confirmation, refusal, retry_later};
 use super::fence::Fence;
-use super::goal::{GoalEntry, StopCause};
+use super::goal::{GoalEntry, LeaseKey, StopCause};
 use super::memory::{Asked, Known, Memory};
 use super::run::STOP_GRACE;
 use super::server::Inner;
@@ -20,6 +20,7 @@ use crate::gate::ending;
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::resource::Lease;
 use ratn_proto::types::Goal;
+use std::collections::VecDeque;
 use std::sync::Arc;
 use tonic::{Code, Status};
 
@@ -29,6 +30,8 @@ const MAX_WAITING: usize = 1_024;
 const MAX_WAITING_PER_CALLER: usize = 128;
 /// Maximum number of goals that run at once on one resource.
 const MAX_RUNNING: usize = 64;
+/// Maximum number of remembered leases under which an action panicked.
+const MAX_PANICKED: usize = 1_024;
 /// Reason code (for programs) of a refusal because too many goals wait.
 pub(crate) const TOO_MANY_WAITING: &str = "TOO_MANY_WAITING";
 
@@ -51,6 +54,8 @@ pub(super) struct State {
     /// Goals whose actions have not returned yet.
     running: Vec<Arc<GoalEntry>>,
     waiting: Vec<WaitingGoal>,
+    /// Leases under which an action panicked: what it moved may still move, and nobody knows when that ends. The last ones.
+    panicked: VecDeque<(String, LeaseKey)>,
     /// The provider shuts down: no goal begins any more.
     closed: bool,
 }
@@ -237,6 +242,19 @@ impl State {
     /// Removes a goal from those that wait.
     pub(super) fn leave(&mut self, entry: &Arc<GoalEntry>) {
         self.waiting.retain(|waiting| !Arc::ptr_eq(&waiting.entry, entry));
+    }
+
+    /// Records that a goal's action has panicked.
+    pub(super) fn panicked(&mut self, entry: &GoalEntry) {
+        if let Some(lease) = entry.lease {
+            self.panicked.push_back((entry.resource.clone(), lease));
+            self.panicked.drain(..self.panicked.len().saturating_sub(MAX_PANICKED));
+        }
+    }
+
+    /// Whether an action under this lease of a resource has panicked.
+    pub(super) fn has_panicked(&self, resource: &str, lease: LeaseKey) -> bool {
+        self.panicked.iter().any(|(at, under)| at == resource && *under == lease)
     }
 
     /// Records that a goal's action has returned.

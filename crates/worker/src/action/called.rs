@@ -1,16 +1,20 @@
 //! The goals that a goal gives to other providers under its lease ([`super::GoalContext::call`]).
 //!
 //! A lease goes back when the goals under it are over, so a goal is over when the goals that it gave are: a call whose future is dropped is told to
-//! stop, and its end is waited for. What does not end in time, or ends unheard, is unknown.
+//! stop, and its end is waited for. Where the connection breaks, its end is asked for again over another one. What does not end in time, or ends
+//! unheard, is unknown.
 //!
 //! ```text
 //! given ─ its end is heard ─────────────────────────────────────────→ over
-//!   └─ the call is dropped, the caller stops or has returned ─ cancel ─ its end is heard ─→ over
-//!                                                                └─ not in time ─────────→ over, unknown
+//!   ├─ the connection breaks ─ attach ─ its end is heard ───────────→ over
+//!   │                            └─ the provider does not know it, or is not reached ─ cancel, attach ─┐
+//!   └─ the call is dropped, the caller stops or has returned ─ cancel ─┬───────────────────────────────┘
+//!                                                                      ├─ its end is heard ─→ over
+//!                                                                      └─ not in time ──────→ over, unknown
 //! ```
 
 use super::run::STOP_GRACE;
-use crate::client::{ActionClient, CallError};
+use crate::client::{ActionClient, CallError, Fate};
 use crate::endpoint::Endpoint;
 use crate::panic::exit_on_panic;
 use crate::trace;
@@ -101,35 +105,55 @@ async fn perform(
     goal: Goal,
     stop: CancellationToken,
 ) -> (Result<GoalOutcome, CallError>, bool) {
-    let id = goal.id.clone();
-    let performed = Box::pin(client.execute_hearing(endpoint, goal, || !stop.is_cancelled(), |_| {}));
-    let mut performed = std::pin::pin!(performed);
-    let fate = tokio::select! {
+    let mut ending = Box::pin(given(client, endpoint, &goal, || !stop.is_cancelled()));
+    let (outcome, is_known) = tokio::select! {
         // The goal is given before it is cancelled.
         biased;
-        fate = &mut performed => fate,
+        ended = &mut ending => ended,
         () = stop.cancelled() => {
             let stopping = async {
                 tokio::select! {
-                    fate = &mut performed => fate,
-                    () = client.stop(endpoint, &id) => performed.await,
+                    ended = &mut ending => ended,
+                    () = client.stop(endpoint, &goal.id) => ending.await,
                 }
             };
             tokio::time::timeout(STOPS_WITHIN, stopping).await.unwrap_or_else(|_| {
-                let reason = format!("goal {id} has not ended within {:.1} s", STOPS_WITHIN.as_secs_f64());
-                Err(CallError::Broken { endpoint: endpoint.clone(), reason })
+                let reason = format!("goal {} has not ended within {:.1} s", goal.id, STOPS_WITHIN.as_secs_f64());
+                (Err(CallError::Broken { endpoint: endpoint.clone(), reason }), false)
             })
         }
     };
-    match fate {
-        Ok(fate) => (Ok(fate.outcome), !fate.may_move),
-        // A provider that refuses a goal has not begun it. Of what cannot be read or has broken nothing is known.
-        Err(error) => {
-            let is_known = !error.is_crash() && !error.is_unreadable();
-            if !is_known {
-                let _ = tokio::time::timeout(STOPS_WITHIN, client.stop(endpoint, &id)).await;
-            }
-            (Err(error), is_known)
-        }
+    // An outcome was heard, with what it says of what may still move.
+    if is_known || outcome.is_ok() {
+        return (outcome, is_known);
     }
+    let _ = tokio::time::timeout(STOPS_WITHIN, client.stop(endpoint, &goal.id)).await;
+    let heard = tokio::time::timeout(STOPS_WITHIN, attached(client, endpoint, &goal)).await;
+    let is_known = matches!(heard, Ok(Ok(Fate { may_move: false, .. })));
+    (outcome, is_known)
+}
+
+/// Gives a goal and waits for its end, over a second connection if the first one breaks. The same as [`perform`].
+async fn given(
+    client: &ActionClient,
+    endpoint: &Endpoint,
+    goal: &Goal,
+    is_wanted: impl Fn() -> bool,
+) -> (Result<GoalOutcome, CallError>, bool) {
+    match client.execute_hearing(endpoint, goal.clone(), is_wanted, |_| {}).await {
+        Ok(fate) => (Ok(fate.outcome), !fate.may_move),
+        // Of what cannot be read or has broken nothing is known yet.
+        Err(error) if error.is_crash() || error.is_unreadable() => match attached(client, endpoint, goal).await {
+            Ok(fate) if !fate.orphaned => (Ok(fate.outcome), !fate.may_move),
+            Ok(fate) => (Err(error), !fate.may_move),
+            Err(_) => (Err(error), false),
+        },
+        // A provider that refuses a goal has not begun it.
+        Err(error) => (Err(error), true),
+    }
+}
+
+/// The end of a goal that was given before.
+async fn attached(client: &ActionClient, endpoint: &Endpoint, goal: &Goal) -> Result<Fate, CallError> {
+    client.attach_hearing(endpoint, goal.clone(), |_| {}).await
 }

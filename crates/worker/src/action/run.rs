@@ -5,7 +5,8 @@
 //!    └─ told to stop ─ runs on after the grace ─→ result sent ─ the action returns ─ its calls are over ─→ resource free
 //!                                                      └─ runs on for much longer ─→ the server is stuck
 //! ```
-//! A goal keeps its resource until its action has returned and the goals that it gave are over, even if a result was sent earlier.
+//! A goal keeps its resource until its action has returned and the goals that it gave are over, even if a result was sent earlier. Of an action that
+//! panicked it is not known whether what it moved stands still: its result says so, and its provider does not confirm standstill.
 
 use super::context::bounded as bounded_progress;
 use super::goal::{Ending, GoalEntry, StopCause};
@@ -73,10 +74,13 @@ pub(super) async fn run(
         entry.calls.end().await;
         performed
     });
-    let mut returned = true;
+    let (mut returned, mut panicked) = (true, false);
     let result = tokio::select! {
         biased;
-        performed = &mut performing => result_of(performed),
+        performed = &mut performing => {
+            panicked = performed.is_err();
+            result_of(performed)
+        }
         () = overdue => {
             returned = false;
             let cause = GoalOutcome::from(entry.stopped()).reason;
@@ -94,11 +98,14 @@ pub(super) async fn run(
         _ => outcome,
     };
     tracing::debug!(goal = %entry.id, outcome = %outcome.outcome, reason = %outcome.reason, "ended");
+    if panicked {
+        server.state().panicked(&entry);
+    }
     if returned {
         // Remove the goal from the running ones before its end is announced: the next goal must find the resource free.
         server.state().end(&entry, server.limits.results_kept);
     }
-    let may_move = !returned || entry.calls.is_unknown();
+    let may_move = !returned || panicked || entry.calls.is_unknown();
     let ending = match entry.cause() {
         Some(StopCause::ShuttingDown) if !outcome.is_success() => Ending::Gone,
         None if lost && !may_move => Ending::Lost(outcome.reason),
@@ -114,12 +121,17 @@ pub(super) async fn run(
         tracing::error!(%goal, %action, %resource, grace_s, "a goal that was told to stop still runs: nothing begins beside it");
         // The action is not aborted: its work in threads or on a device would go on unseen.
         let patience = server.stuck_after.unwrap_or(Duration::MAX);
-        if tokio::time::timeout(patience, &mut performing).await.is_err() {
-            let told_s = (STOP_GRACE + patience).as_secs();
-            server
-                .stuck
-                .send_replace(Some(format!("goal {goal} of {action} was told to stop {told_s} s ago, and still runs")));
-            let _ = performing.as_mut().await;
+        let performed = match tokio::time::timeout(patience, &mut performing).await {
+            Ok(performed) => performed,
+            Err(_) => {
+                let told_s = (STOP_GRACE + patience).as_secs();
+                let stuck = format!("goal {goal} of {action} was told to stop {told_s} s ago, and still runs");
+                server.stuck.send_replace(Some(stuck));
+                performing.as_mut().await
+            }
+        };
+        if performed.is_err() {
+            server.state().panicked(&entry);
         }
         tracing::warn!(%goal, %action, %resource, "the goal that was told to stop has ended after all");
         server.state().end(&entry, server.limits.results_kept);

@@ -427,8 +427,11 @@ impl LeaseListener for Inner {
 
     fn under_way(&self, resource: &str, lease: Option<LeaseKey>) -> Vec<CancellationToken> {
         let state = self.state();
+        // What a panicked action moved is never known to stand still: this one does not fire.
+        let for_ever = lease.filter(|lease| state.has_panicked(resource, *lease)).map(|_| CancellationToken::new());
         let at = state.running().filter(|goal| goal.resource == resource);
-        at.filter(|goal| lease.is_none() || goal.lease == lease).map(|goal| goal.returned.clone()).collect()
+        let at = at.filter(|goal| lease.is_none() || goal.lease == lease).map(|goal| goal.returned.clone());
+        at.chain(for_ever).collect()
     }
 }
 
@@ -442,5 +445,49 @@ impl fmt::Debug for ActionServerBuilder {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let actions: Vec<&String> = self.actions.keys().collect();
         f.debug_struct("ActionServerBuilder").field("resource", &self.resource).field("actions", &actions).finish()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use crate::action::ActionResult;
+    use ratn_model::id::{FencingToken, LeaseId};
+    use ratn_model::resource::{Lease, LeasedResource};
+    use ratn_proto::v1::execute_response::Kind;
+
+    struct Panics;
+
+    #[tonic::async_trait]
+    impl Action for Panics {
+        fn name(&self) -> &str {
+            "panics"
+        }
+
+        async fn execute(&self, _: GoalContext) -> ActionResult {
+            panic!("on purpose")
+        }
+    }
+
+    #[tokio::test]
+    async fn what_a_panicked_action_moved_is_not_known_to_stand_still_as_long_as_its_lease_is_ending() {
+        let server = ActionServer::builder("arm").dangerously_believe_every_lease().action(Panics).build();
+        let (id, kind, endpoint) = ("arm".to_owned(), "Arm".to_owned(), String::new());
+        let resources = vec![LeasedResource { id, kind, endpoint, superclasses: Vec::new() }];
+        let lease = Lease { id: LeaseId(7), token: FencingToken(70), resources, consumed: Vec::new() };
+        let goal = Goal { id: "g".to_owned(), action: "panics".to_owned(), lease: Some(lease), ..Goal::default() };
+        let mut messages = server.admit(&Caller::default(), goal, Fingerprint::of(None)).await.unwrap();
+        let result = loop {
+            if let Kind::Result(result) = messages.next().await.unwrap().unwrap() {
+                break result;
+            }
+        };
+        assert!(result.may_move);
+        let under_way = |resource: &str, lease: Option<LeaseKey>| server.inner.under_way(resource, lease).len();
+        let (own, other) = ((LeaseId(7), FencingToken(70)), (LeaseId(8), FencingToken(80)));
+        assert_eq!(under_way("arm", Some(own)), 1);
+        assert!(!server.inner.under_way("arm", Some(own))[0].is_cancelled());
+        assert_eq!([under_way("arm", Some(other)), under_way("leg", Some(own)), under_way("arm", None)], [0, 0, 0]);
     }
 }

@@ -3,6 +3,7 @@
 use super::retry::{PAUSE, TRIES};
 use super::{CallError, Channels, chain};
 use crate::endpoint::Endpoint;
+use crate::multiplex::client::end_of_stream;
 use crate::trace::Traced;
 use ratn_model::catalogue::WorkerDescription;
 use ratn_model::value::Value;
@@ -228,7 +229,14 @@ impl ActionClient {
             Question::Attach(question) => client.attach(question).await,
         };
         let mut answers = answers?.into_inner();
-        while let Some(answer) = answers.message().await? {
+        let mut is_begun = false;
+        // Once the provider has begun the goal, a refusal is the end of the stream, and no answer of the provider.
+        let ended = |is_begun: bool, status: Status| match status.code() {
+            Code::PermissionDenied | Code::ResourceExhausted if is_begun => end_of_stream(status),
+            _ => status,
+        };
+        while let Some(answer) = answers.message().await.map_err(|status| ended(is_begun, status))? {
+            is_begun = true;
             match answer.kind {
                 Some(Kind::Progress(progress)) => heard(Heard::Progress(progress)),
                 Some(Kind::Improved(better)) => heard(Heard::Improved(better)),

@@ -24,6 +24,8 @@ pub struct ConnectionLimits {
     pub first_call: Duration,
     /// Maximum time without a call under way.
     pub idle: Duration,
+    /// Maximum time in which the client takes no part of the answers that wait for it, of those that count ([`crate::gate::Gate::unread`]).
+    pub unread: Duration,
 }
 
 impl Default for ConnectionLimits {
@@ -35,6 +37,7 @@ impl Default for ConnectionLimits {
             for_operators: 128,
             first_call: Duration::from_secs(10),
             idle: Duration::from_secs(600),
+            unread: Duration::from_secs(300),
         }
     }
 }

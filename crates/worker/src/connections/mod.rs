@@ -12,7 +12,7 @@
 //! - The number of connections with calls under way is bounded per caller, and for all callers that are not operators together. The rest
 //!   ([`ConnectionLimits::for_operators`]) is reserved for operators, and for connections without a first call.
 //! - If the maximum number is reached, a connection without a call under way is closed for a new one (`State::gives_way`).
-//! - A connection without a call is closed at its deadline.
+//! - A connection without a call is closed at its deadline, and so is one whose client takes nothing of the answers that wait for it.
 
 pub(crate) mod accepting;
 mod authority;
@@ -64,6 +64,10 @@ struct Open {
     quiet_since: Instant,
     had_a_call: bool,
     calls: usize,
+    /// Parts of answers that wait for the client.
+    unread: usize,
+    /// Since when the client has taken none of them.
+    unread_since: Instant,
     /// The caller for whom the connection is counted while it is in use.
     caller: Option<Caller>,
 }
@@ -85,8 +89,17 @@ impl Connections {
         }
         let (id, close) = (state.next, CancellationToken::new());
         state.next += 1;
-        let quiet_since = Instant::now();
-        let open = Open { close: close.clone(), peer, quiet_since, had_a_call: false, calls: 0, caller: None };
+        let now = Instant::now();
+        let open = Open {
+            close: close.clone(),
+            peer,
+            quiet_since: now,
+            had_a_call: false,
+            calls: 0,
+            unread: 0,
+            unread_since: now,
+            caller: None,
+        };
         state.open.insert(id, open);
         drop(state);
         let link = Link { id, connections: self.clone() };
@@ -105,9 +118,17 @@ impl Connections {
         loop {
             interval.tick().await;
             let state = self.state();
-            for open in state.open.values().filter(|open| open.calls == 0) {
+            for open in state.open.values().filter(|open| !open.close.is_cancelled()) {
                 let patience = if open.had_a_call { self.limits.idle } else { self.limits.first_call };
-                if open.quiet_since.elapsed() >= patience {
+                if open.calls == 0 && open.quiet_since.elapsed() >= patience {
+                    open.close.cancel();
+                } else if open.unread > 0 && open.unread_since.elapsed() >= self.limits.unread {
+                    let who = open.caller.as_ref().map_or("", |caller| &*caller.name);
+                    tracing::info!(
+                        who,
+                        parts = open.unread,
+                        "a connection is closed: its client does not read its answers"
+                    );
                     open.close.cancel();
                 }
             }
@@ -182,6 +203,23 @@ impl Link {
         }
     }
 
+    /// A part of an answer waits for the client until the returned value is dropped.
+    pub(crate) fn waits(&self) -> Waits {
+        if let Some(open) = self.connections.state().open.get_mut(&self.id) {
+            if open.unread == 0 {
+                open.unread_since = Instant::now();
+            }
+            open.unread += 1;
+        }
+        Waits(self.clone())
+    }
+
+    fn taken(&self) {
+        if let Some(open) = self.connections.state().open.get_mut(&self.id) {
+            (open.unread, open.unread_since) = (open.unread.saturating_sub(1), Instant::now());
+        }
+    }
+
     fn end(&self, all: bool) {
         let mut state = self.connections.state();
         let State { open, in_use, in_use_of_others, .. } = &mut *state;
@@ -212,5 +250,15 @@ pub(crate) struct InUse(Link);
 impl Drop for InUse {
     fn drop(&mut self) {
         self.0.end(false);
+    }
+}
+
+/// Marks a part of an answer that waits for the client of a connection.
+#[derive(Debug)]
+pub(crate) struct Waits(Link);
+
+impl Drop for Waits {
+    fn drop(&mut self) {
+        self.0.taken();
     }
 }

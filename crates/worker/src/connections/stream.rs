@@ -19,6 +19,16 @@ pub(crate) struct Connection<S> {
 }
 
 impl<S> Connection<S> {
+    /// Whether the connection was told to close. The other end may neither say nor take anything then, so reading and writing both end.
+    fn is_told_to_close(&mut self, context: &mut Context<'_>) -> io::Result<()> {
+        match self.closed.as_mut().poll(context) {
+            Poll::Ready(()) => {
+                Err(io::Error::new(io::ErrorKind::TimedOut, "nothing was asked for, or taken, for too long"))
+            }
+            Poll::Pending => Ok(()),
+        }
+    }
+
     /// Marks a connection at a Unix socket, where clients may send the path as the server's name.
     pub(crate) fn at_a_path(mut self) -> Connection<S> {
         self.authority = Some(Authority::default());
@@ -56,9 +66,7 @@ impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
-        if self.closed.as_mut().poll(context).is_ready() {
-            return Poll::Ready(Err(io::Error::new(io::ErrorKind::TimedOut, "nothing was asked for too long")));
-        }
+        self.is_told_to_close(context)?;
         let known = buffer.filled().len();
         let read = Pin::new(&mut self.stream).poll_read(context, buffer);
         if let Some(authority) = &mut self.authority {
@@ -70,6 +78,7 @@ impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
 
 impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        self.is_told_to_close(context)?;
         Pin::new(&mut self.stream).poll_write(context, bytes)
     }
 
@@ -86,6 +95,7 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
         context: &mut Context<'_>,
         parts: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
+        self.is_told_to_close(context)?;
         Pin::new(&mut self.stream).poll_write_vectored(context, parts)
     }
 

@@ -142,3 +142,43 @@ async fn a_connection_without_a_call_is_closed_at_its_deadline() {
     assert!(is_closed(&mut open[0]).await);
     assert!(!is_closed(&mut open[1]).await && !is_closed(&mut open[2]).await, "they have longer");
 }
+
+#[tokio::test]
+async fn a_connection_whose_client_takes_nothing_of_its_answers_is_closed_and_so_is_one_that_hangs_in_a_write() {
+    let far_away = Duration::from_secs(3_600);
+    let unread =
+        |unread| Connections::new(ConnectionLimits { unread, first_call: far_away, idle: far_away, ..limits() });
+    for (patience, is_late) in [(Duration::ZERO, true), (far_away, false)] {
+        let connections = unread(patience);
+        let mut open: Vec<_> = (0..3).map(|_| accept(&connections, host(1)).unwrap()).collect();
+        let (first, second) = (link(&open[0].0), link(&open[1].0));
+        let (_waits, taken) = ((first.waits(), first.waits()), second.waits());
+        drop(taken);
+        // The buffer of the third one has room for one byte.
+        let (mut third, _far) = open.pop().unwrap();
+        let _in_a_write = link(&third).waits();
+        let mut writing = Box::pin(tokio::io::AsyncWriteExt::write_all(&mut third, &[0; 8]));
+        let hangs = tokio::time::timeout(Duration::from_millis(1), &mut writing).await;
+        assert!(hangs.is_err());
+        let _ = tokio::time::timeout(SWEEP_INTERVAL / 2, connections.sweep()).await;
+        let written = tokio::time::timeout(Duration::from_millis(100), writing).await;
+        assert_eq!(written.is_ok_and(|written| written.is_err()), is_late);
+        assert_eq!(is_closed(&mut open[0]).await, is_late);
+        assert!(!is_closed(&mut open[1]).await, "it has taken all");
+    }
+}
+
+#[tokio::test]
+async fn who_takes_a_part_of_its_answers_has_as_long_again_for_the_rest() {
+    let connections = Connections::new(limits());
+    let (connection, _far) = accept(&connections, host(1)).unwrap();
+    let link = link(&connection);
+    let since = || connections.state().open[&link.id].unread_since;
+    let (first, _second) = (link.waits(), link.waits());
+    let before = since();
+    tokio::time::sleep(Duration::from_millis(1)).await;
+    let _third = link.waits();
+    assert_eq!(since(), before, "more waits");
+    drop(first);
+    assert!(since() > before);
+}

@@ -13,6 +13,7 @@
 
 use super::standstill::{Ending, Endings};
 use ratn_model::id::{FencingToken, LeaseId};
+use ratn_model::resource::ResourceClass;
 use ratn_proto::types::{Resource, ResourceEvent, ResourceEventKind, ResourceUpdate};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -253,7 +254,9 @@ impl Holdings {
     }
 
     fn holders(&self, resource: &Resource) -> BTreeMap<LeaseId, Holder> {
-        if self.owner.as_ref().is_some_and(|owner| *owner != resource.session) {
+        let is_anothers = self.owner.as_ref().is_some_and(|owner| *owner != resource.session);
+        // The resource of a task is no provider's, whatever its session is called: a manager that lost its state gives that id to anybody.
+        if is_anothers || resource.class == ResourceClass::Task {
             return BTreeMap::new();
         }
         let holder = |holding: &ratn_proto::types::Holding| {
@@ -286,7 +289,7 @@ impl Holdings {
 mod tests {
     use super::*;
     use ratn_model::id::Revision;
-    use ratn_model::resource::{Quantity, ResourceClass};
+    use ratn_model::resource::Quantity;
     use ratn_proto::types::Holding;
 
     fn arm(leases: &[u64]) -> Resource {
@@ -445,5 +448,18 @@ mod tests {
         holdings.begin("cell", true);
         holdings.tell(&snapshot(&[arm(&[8])], 8));
         assert_eq!(holdings.check(&claim(8)), ClaimStatus::Confirmed);
+    }
+
+    #[test]
+    fn what_a_task_creates_under_the_id_of_this_provider_and_its_session_is_not_this_provider() {
+        let mut holdings = Holdings::default();
+        holdings.begin("cell", false);
+        let of_class = |class| Resource { class, ..arm(&[7]) };
+        holdings.tell(&snapshot(&[of_class(ResourceClass::Task)], 7));
+        refuted(&holdings, claim(7), "no lease holds it");
+        holdings.tell(&event(ResourceEventKind::Leased, of_class(ResourceClass::Task), 7));
+        refuted(&holdings, claim(7), "no lease holds it");
+        holdings.tell(&snapshot(&[of_class(ResourceClass::Process)], 7));
+        assert_eq!(holdings.check(&claim(7)), ClaimStatus::Confirmed);
     }
 }

@@ -1,7 +1,7 @@
 //! The client side: the calls of all tasks share one stream.
 //!
-//! The stream is opened with the first call, and again with the first call after it broke; calls under way then fail as separate calls
-//! would. A call does not wait for the other side's answer to the opening: many servers send that with their first message, which is the
+//! The stream is opened with the first call, and again with the first call after it broke; calls under way then fail as where a connection
+//! breaks, whatever the server gave as the reason. A call does not wait for the other side's answer to the opening: many servers send that with their first message, which is the
 //! answer to a call. A call that is dropped before the stream is open is not sent: its caller may have done something else since.
 
 use super::Protocol;
@@ -13,7 +13,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll};
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::Stream as Incoming;
-use tonic::{Response, Status, Streaming};
+use tonic::{Code, Response, Status, Streaming};
 
 /// Maximum number of requests that wait for the connection; further callers wait.
 const OUTGOING: usize = 1_024;
@@ -235,7 +235,7 @@ impl<P: Protocol, F: FnOnce(&mut P::Call)> Drop for UnderWay<'_, P, F> {
 async fn read<P: Protocol>(opened: impl Future<Output = Opened<P>>, calls: Arc<Mutex<Calls<P>>>) {
     let lock = || calls.lock().unwrap_or_else(PoisonError::into_inner);
     let broken = match opened.await {
-        Err(status) => status,
+        Err(status) => end_of_opening(status),
         Ok(opened) => {
             let mut responses = opened.into_inner();
             loop {
@@ -245,7 +245,7 @@ async fn read<P: Protocol>(opened: impl Future<Output = Opened<P>>, calls: Arc<M
                         lock().answered(id, answer);
                     }
                     Ok(None) => break closed(),
-                    Err(status) => break status,
+                    Err(status) => break end_of_stream(status),
                 }
             }
         }
@@ -259,6 +259,29 @@ async fn read<P: Protocol>(opened: impl Future<Output = Opened<P>>, calls: Arc<M
 
 fn closed() -> Status {
     Status::unavailable("the stream was closed")
+}
+
+/// The end of a stream that was open is no answer to a call: what was called may be under way. So a refusal (the caller has lost a role, or a quota is
+/// reached) counts as a broken connection. What cannot be read, and a method that is not there, stay what they are.
+pub(crate) fn end_of_stream(status: Status) -> Status {
+    use Code::{Cancelled, DataLoss, Internal, OutOfRange, Unavailable, Unimplemented, Unknown};
+    match status.code() {
+        OutOfRange | Unimplemented | Internal | Unknown | Cancelled | DataLoss => status,
+        Unavailable if status.details().is_empty() => status,
+        // Made on this side.
+        _ if std::error::Error::source(&status).is_some() => status,
+        _ => Status::unavailable(format!("it has ended the stream: {}", status.message())),
+    }
+}
+
+/// The stream was not opened. A server of this system refuses that before it takes a call, and says why in details. Others may open it with their first
+/// answer, so this may be the end of a stream on which calls are under way.
+fn end_of_opening(status: Status) -> Status {
+    match status.code() {
+        Code::PermissionDenied | Code::Unauthenticated => status,
+        _ if !status.details().is_empty() => status,
+        _ => end_of_stream(status),
+    }
 }
 
 impl<P: Protocol> Clone for Multiplexer<P> {
@@ -288,10 +311,13 @@ impl<P: Protocol> std::fmt::Debug for Multiplexer<P> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::client::CallError;
+    use crate::endpoint::Endpoint;
     use crate::multiplex::WorldCalls;
     use futures::{FutureExt, StreamExt};
     use ratn_proto::v1::WorldPoolServiceReleaseRequest;
     use ratn_proto::v1::calls_request::Kind;
+    use tonic_types::{ErrorDetails, StatusExt};
 
     fn release(projection_id: u64) -> Kind {
         Kind::Release(WorldPoolServiceReleaseRequest { projection_id })
@@ -320,5 +346,27 @@ mod tests {
         let _ = connected.send(());
         assert_eq!(sent.await.unwrap_or_default(), [Some(release(2))]);
         assert_eq!(waits.await.map_err(|status| status.message().to_owned()), Err("enough".to_owned()));
+    }
+
+    #[test]
+    fn the_end_of_a_stream_is_no_refusal_of_a_call_and_the_refusal_to_open_it_is() {
+        let endpoint = Endpoint::Unix("/here".into());
+        let is_refused = |status| !CallError::from_status(&endpoint, &status).is_crash();
+        let with_details = |code| {
+            let details = ErrorDetails::with_error_info("NOT_AT_REST", "ratn", []);
+            Status::with_error_details(code, "why", details)
+        };
+        let codes = [Code::PermissionDenied, Code::ResourceExhausted, Code::FailedPrecondition, Code::Unavailable];
+        for code in codes {
+            let status = with_details(code);
+            assert!(is_refused(status.clone()) && is_refused(end_of_opening(status.clone())), "{code}");
+            assert!(!is_refused(end_of_stream(status)), "{code}");
+        }
+        // The server of another library, for one request that is too long, with others under way.
+        assert!(!is_refused(end_of_opening(Status::resource_exhausted("larger than max"))));
+        assert!(is_refused(end_of_opening(Status::permission_denied("viewers look"))));
+        let unreadable = CallError::from_status(&endpoint, &end_of_stream(Status::out_of_range("too long")));
+        assert!(unreadable.is_unreadable());
+        assert_eq!(end_of_stream(Status::unimplemented("no such method")).code(), Code::Unimplemented);
     }
 }

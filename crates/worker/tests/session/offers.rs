@@ -31,7 +31,7 @@ async fn resources_are_offered_updated_and_withdrawn() {
     let (_directory, endpoint) = place();
     let manager = Manager::new();
     let channels = channels();
-    let session = Session::open(&channels, &endpoint, "cell", TTL);
+    let session = Session::open(&channels, &endpoint, "cell", LONG);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     // Before there is a manager: later, by itself.
     assert!(!provider.offer(arm()).await.unwrap());
@@ -55,7 +55,7 @@ async fn what_was_withdrawn_while_nobody_answered_is_gone_once_somebody_does() {
     let manager = Manager::new();
     let (stop, serving) = manager.serve(&endpoint).await;
     let channels = channels();
-    let session = Session::open(&channels, &endpoint, "cell", TTL);
+    let session = Session::open(&channels, &endpoint, "cell", LONG);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     session.alive(LONG).await.unwrap();
     assert!(provider.offer(arm()).await.unwrap());
@@ -75,7 +75,7 @@ async fn a_resource_that_another_session_still_has_is_offered_until_that_one_is_
     manager.pool.lock().unwrap().taken.insert("arm@sim".to_owned());
     let _serving = manager.serve(&endpoint).await;
     let channels = channels();
-    let session = Session::open(&channels, &endpoint, "cell", TTL);
+    let session = Session::open(&channels, &endpoint, "cell", LONG);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     session.alive(LONG).await.unwrap();
     assert!(!provider.offer(arm()).await.unwrap());
@@ -90,7 +90,7 @@ async fn a_resource_that_went_with_its_session_before_its_creation_was_answered_
     manager.pool.lock().unwrap().short_lived = 2;
     let _serving = manager.serve(&endpoint).await;
     let channels = channels();
-    let session = Session::open(&channels, &endpoint, "cell", TTL);
+    let session = Session::open(&channels, &endpoint, "cell", LONG);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     session.alive(LONG).await.unwrap();
     assert!(!provider.offer(arm()).await.unwrap());

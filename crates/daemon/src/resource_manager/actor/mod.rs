@@ -382,12 +382,13 @@ fn refuse_change(message: Message, stopped: Status, context: &mut ResourceTurn) 
     match message {
         Message::Perform { answer, .. } => context.reply(answer, Err(stopped)),
         Message::Acquire { answer, .. } => context.reply(answer, Err(stopped)),
+        // A session is checked for it, which makes time go on.
+        Message::Recall { answer, .. } => context.reply(answer, Err(stopped)),
         Message::Withdraw { answer, .. } => context.reply(answer, Err(stopped)),
         Message::WatchDemand { answer, .. } => context.reply(answer, Err(stopped)),
         Message::ReportShortage { answer, .. } => context.reply(answer, Err(stopped)),
         Message::Abandon { .. } | Message::Return { .. } | Message::Undo { .. } => {}
         read @ (Message::Search { .. }
-        | Message::Recall { .. }
         | Message::Get { .. }
         | Message::List { .. }
         | Message::Revision { .. }

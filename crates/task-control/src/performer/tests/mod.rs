@@ -82,6 +82,7 @@ fn finished(instance: InstanceId) -> Event {
         measured: Vec::new(),
         evidence: Vec::new(),
         reason: String::new(),
+        at_rest: true,
     }
 }
 

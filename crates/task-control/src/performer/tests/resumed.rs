@@ -362,3 +362,56 @@ async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() ->
     assert_eq!(bench.performer.root().await?.0, Revision(2));
     bench.performer.closed().await
 }
+
+#[tokio::test]
+async fn what_a_run_held_before_it_came_back_goes_back_at_rest_where_its_log_says_so() -> anyhow::Result<()> {
+    let first = InstanceId(1);
+    let ended = |at_rest| match finished(first) {
+        Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason, .. } => {
+            Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason, at_rest }
+        }
+        other => other,
+    };
+    let (reason, unknown, refused) = (String::new(), false, false);
+    let crashed = Event::Crashed { instance: first, attempt: 1, reason, unknown, refused };
+    for (end, was_under_way_back, at_rest) in [
+        (ended(true), false, true),
+        (ended(true), true, true),
+        (ended(false), false, false),
+        (ended(false), true, false),
+        // It is looked for again, and not found.
+        (crashed, false, false),
+    ] {
+        let bench = Bench::new().await?;
+        let (channels, manager) = (Channels::new(&ClientTls::none()), &bench.endpoints.resource_manager);
+        // Nobody confirms its standstill.
+        let mover = Resource::new("mover", ResourceClass::Module, "Mover").with_standstill(SESSION_DEADLINE);
+        ResourceClient::new(&channels, manager, bench._robot.id())?.create(mover).await?;
+        let (run, resources) = (bench.performer.run.clone(), bench.performer.resources.clone());
+        let requirements = vec![Requirement::new(ResourceOperation::Block, "Mover")];
+        let lease = resources.acquire(requirements.clone(), AcquireOptions::default()).await?;
+        let release = Command::Release { instance: first, lease: Some(lease.id), projection: None };
+        let mut ledger = ledger(&run, &[Command::Acquire { instance: first, requirements, priority: 0 }]);
+        ledger.event(Timestamp(0), &Event::Granted { instance: first, lease: lease.clone() });
+        ledger.command(&start(first, 1, "work", lease.id, "unix:/nowhere"));
+        ledger.event(Timestamp(0), &end);
+        if was_under_way_back {
+            ledger.command(&release);
+        }
+        let mut bench = bench.comes_back(true).await?;
+        bench.takes_up(ledger, &World::default()).await?;
+        if !was_under_way_back {
+            bench.performer.perform(release)?;
+        }
+        let ending = loop {
+            let mover = resources.get("mover").await?;
+            if mover.holdings.is_empty() {
+                break mover.ending;
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        };
+        assert_eq!(ending.is_empty(), at_rest, "{end:?}, {was_under_way_back}");
+        bench.performer.closed().await?;
+    }
+    Ok(())
+}
