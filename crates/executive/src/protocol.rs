@@ -226,6 +226,22 @@ pub enum Event {
         /// The provider's message.
         message: String,
     },
+    /// The goal waits before it is given to its provider: until cancelled goals have ended, or until the root contains what was decided before it. Its
+    /// timeout does not count meanwhile. Only of goals with a timeout; [`Event::Given`] follows.
+    Delayed {
+        /// The instance.
+        instance: InstanceId,
+        /// Its attempt.
+        attempt: u32,
+    },
+    /// The goal is given to its provider after a delay, or was found there by a task control that was restarted. Its timeout counts from now, unless it
+    /// counts already.
+    Given {
+        /// The instance.
+        instance: InstanceId,
+        /// Its attempt.
+        attempt: u32,
+    },
     /// An anytime goal has its first usable result, or a better one, and goes on improving it.
     Improved {
         /// The instance.

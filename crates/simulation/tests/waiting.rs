@@ -6,7 +6,9 @@ mod support;
 
 use ratn_executive::executive::Executive;
 use ratn_executive::protocol::{Command, Event, Learned, Mode, Note};
-use ratn_model::id::{InstanceId, Revision};
+use ratn_model::fact::{FactKey, Term};
+use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision};
+use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
@@ -208,6 +210,107 @@ fn who_gets_the_next_signal_is_known_before_it_is_sent() {
                 let ends = |command: &Command| matches!(command, Command::Note(Note::Finished { instance, .. }) if *instance == named);
                 assert!(commands.iter().any(ends), "{mode:?} {task}");
             }
+        }
+    }
+}
+
+/// Tells the executive what comes at a second.
+fn at(executive: &mut Executive, second: f64, event: Event) -> Vec<Command> {
+    executive.handle(Timestamp::from_seconds(second), event)
+}
+
+/// The instance that has just asked for resources gets them.
+fn grant(executive: &mut Executive, commands: &[Command], second: f64) -> Vec<Command> {
+    let asks = commands.iter().find_map(|command| match command {
+        Command::Acquire { instance, .. } => Some(*instance),
+        _ => None,
+    });
+    let instance = asks.unwrap();
+    let (id, token) = (LeaseId(instance.0), FencingToken(instance.0));
+    let lease = Lease { id, token, resources: Vec::new(), consumed: Vec::new() };
+    at(executive, second, Event::Granted { instance, lease })
+}
+
+/// The attempts that are started.
+fn started(commands: &[Command]) -> Vec<(InstanceId, u32)> {
+    let start = |command: &Command| match command {
+        Command::Start { instance, attempt, .. } => Some((*instance, *attempt)),
+        _ => None,
+    };
+    commands.iter().filter_map(start).collect()
+}
+
+fn cancelled(commands: &[Command]) -> Vec<InstanceId> {
+    let cancel = |command: &Command| match command {
+        Command::Cancel { instance, .. } => Some(*instance),
+        _ => None,
+    };
+    commands.iter().filter_map(cancel).collect()
+}
+
+#[test]
+fn watched_motions_end_in_the_order_in_which_they_began_to_move() {
+    let task = "
+task: t
+world: [closed(door)]
+states:
+  - both:
+      concurrency: barrier
+      regions:
+        - one:
+            shared: ['closed(door)', 'first()']
+            states:
+              - move: { action: arm/move, pia: true, while: [closed(door)], reads: [],
+                  effects: { violated: [first() = 1] }, resources: [{ block: Arm }, { block: WorldModel }] }
+        - two:
+            shared: ['closed(door)', 'first()']
+            states:
+              - rest: { wait: { seconds: 1 } }
+              - turn: { action: head/turn, pia: true, while: [closed(door)], reads: [],
+                  effects: { violated: [first() = 2] }, resources: [{ block: Head }] }
+";
+    let door = FactKey { predicate: "closed".to_owned(), arguments: vec![Term::Name("door".to_owned())] };
+    for mode in MODES {
+        let (mut executive, mut commands) = begun(task, mode);
+        // The first has its resources, and waits for its projection until the second has begun.
+        commands = grant(&mut executive, &commands, 0.5);
+        let project = commands.iter().find_map(|command| match command {
+            Command::Project { instance, attempt, .. } => Some((*instance, *attempt)),
+            _ => None,
+        });
+        let (instance, attempt) = project.unwrap();
+        commands = at(&mut executive, 1.0, Event::Woken);
+        assert_eq!(started(&grant(&mut executive, &commands, 1.0)).len(), 1, "{mode:?}");
+        let projection = ProjectionId(1);
+        assert_eq!(started(&at(&mut executive, 1.5, Event::Projected { instance, attempt, projection })).len(), 1);
+        let opened = Event::WorldChanged { revision: Revision(9), facts: vec![(door.clone(), None)] };
+        assert_eq!(cancelled(&at(&mut executive, 2.0, opened)).last(), Some(&instance), "{mode:?}");
+        let first = FactKey { predicate: "first".to_owned(), arguments: Vec::new() };
+        assert_eq!(executive.root().get(&first), Some(&Value::Int(1)), "{mode:?}");
+    }
+}
+
+#[test]
+fn the_timeout_of_a_goal_counts_from_when_it_is_given_to_its_provider() {
+    let plain =
+        "  - move: { action: pen/note, pia: true, reads: [], effects: [], resources: [{ block: Pen }], timeout: 2 }\n";
+    let inside = format!("  - around:\n      routine: true\n      states:\n      {plain}");
+    for states in [plain, &inside] {
+        let task = format!("task: t\nstates:\n{states}");
+        for mode in MODES {
+            let (mut executive, commands) = begun(&task, mode);
+            let (instance, attempt) = started(&grant(&mut executive, &commands, 0.0))[0];
+            // Goals that were told to stop have to end first.
+            at(&mut executive, 0.1, Event::Delayed { instance, attempt });
+            assert_eq!(cancelled(&at(&mut executive, 3.0, Event::Woken)), [], "{mode:?}");
+            let given = at(&mut executive, 3.5, Event::Given { instance, attempt });
+            assert!(given.contains(&Command::Wake { at: Timestamp::from_seconds(5.5) }), "{mode:?} {given:?}");
+            // It is heard of again: the clock goes on.
+            at(&mut executive, 4.0, Event::Given { instance, attempt });
+            assert_eq!(cancelled(&at(&mut executive, 5.4, Event::Woken)), [], "{mode:?}");
+            let late = at(&mut executive, 5.5, Event::Woken);
+            assert_eq!(cancelled(&late), [instance], "{mode:?}");
+            assert!(executive.has_ended(), "{mode:?}");
         }
     }
 }

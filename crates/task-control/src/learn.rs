@@ -94,6 +94,12 @@ impl Fold {
                     *total_s += at.since(began).as_secs_f64();
                 }
             }
+            // Until now it waited before it was given to its provider.
+            Event::Given { instance, attempt } => {
+                if let Some(started) = self.started.get_mut(instance).filter(|started| started.0 == *attempt) {
+                    started.1 = at;
+                }
+            }
             Event::Crashed { instance, .. } => drop(self.started.remove(instance)),
             // The duration of what was under way is unknown.
             Event::Resumed { .. } => self.started.clear(),

@@ -248,6 +248,8 @@ impl Progress {
             | Event::Granted { .. }
             | Event::Projected { .. }
             | Event::Progressed { .. }
+            | Event::Delayed { .. }
+            | Event::Given { .. }
             | Event::Recorded { .. }
             | Event::Woken
             | Event::WantedByOthers { .. }

@@ -45,6 +45,18 @@ impl Interpreter {
         }
     }
 
+    /// A goal has been given to its provider, or waits before it is: its timeout counts from then.
+    pub(super) fn given(&mut self, context: &mut Context<'_>, thread: u64, is_given: bool) {
+        let Some(current) = self.current(thread).filter(|current| current.phase == Phase::Running) else { return };
+        if !is_given {
+            current.timeout = None;
+        } else if current.timeout.is_none() {
+            let limit_s = context.program.state(current.state).annotations.timeout_s;
+            current.timeout = limit_s.map(|limit_s| context.now + span(limit_s));
+            context.commands.extend(current.timeout.map(|at| Command::Wake { at }));
+        }
+    }
+
     /// A goal has ended: finishes the node with its result, unless it is tried again.
     pub(super) fn goal_ended(&mut self, context: &mut Context<'_>, thread: u64, end: GoalEnd) {
         if end.outcome != ABORTED || !self.is_tried_again(context, thread, false) {

@@ -188,7 +188,7 @@ struct Current {
     /// When the goal or the wait began.
     #[serde(default)]
     since: Timestamp,
-    /// When the goal reaches its timeout.
+    /// When the goal reaches its timeout; `None` while it waits before it is given to its provider.
     timeout: Option<Timestamp>,
     #[serde(with = "leases")]
     lease: Option<Lease>,
@@ -407,6 +407,11 @@ impl Interpreter {
                         current.projection = Some(projection);
                     }
                     self.run(context, thread);
+                }
+            }
+            Event::Delayed { instance, attempt } | Event::Given { instance, attempt } => {
+                if let Some(thread) = of(self, instance, Some(attempt)) {
+                    self.given(context, thread, matches!(event, Event::Given { .. }));
                 }
             }
             Event::Crashed { instance, attempt, reason, unknown, refused } => {

@@ -206,10 +206,12 @@ impl Window {
         seed.of_try(if state.annotations.deterministic { 1 } else { tries })
     }
 
-    /// A motion may begin: sensing nodes that would see it, and have not begun or are speculative, step back.
+    /// A motion may begin: sensing nodes that would see it, and have not begun, are speculative or run ahead in another region, step back.
     fn clear_view(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(instance) = self.graph.get(id) else { return };
-        let sensing = self.dispatch.active().filter_map(|id| self.graph.get(id)).filter(|other| other.is_sensing());
+        let runs_ahead = |other: &Instance| other.node().is_some_and(|node| !node.is_at_its_place);
+        let active = self.dispatch.active().filter_map(|id| self.graph.get(id));
+        let sensing = active.filter(|other| other.is_sensing() && runs_ahead(other));
         let sensing: Vec<InstanceId> = sensing.map(|other| other.id).collect();
         if sensing.is_empty() {
             return;
@@ -425,7 +427,7 @@ impl Window {
         if let Some(timeout_s) = state.annotations.timeout_s {
             self.set_timer(context, timeout_s, Timer::Timeout(id, attempt));
         }
-        self.graph.run(id);
+        self.graph.run(id, context.now);
         context.note(Note::Running { instance: id, attempt });
         context.commands.push(Command::Start { instance: id, attempt, goal: Box::new(goal) });
     }

@@ -4,7 +4,7 @@ use super::graph::instance::{Ended, Status};
 use super::waits::Timer;
 use super::{End, Window};
 use crate::context::Context;
-use crate::protocol::Command;
+use crate::protocol::{Command, Event};
 use crate::turn::Turn;
 use ratn_model::id::InstanceId;
 use ratn_model::time::Timestamp;
@@ -54,6 +54,21 @@ impl Window {
             }
             Timer::Timeout(id, attempt) if !self.is_at(id, attempt) => Vec::new(),
             _ => vec![(turn, timer)],
+        }
+    }
+
+    /// A goal waits before it is given to its provider, or has been given: its timeout counts from then.
+    pub(super) fn given(&mut self, context: &mut Context<'_>, event: Event) {
+        let (Event::Delayed { instance: id, attempt } | Event::Given { instance: id, attempt }) = event else { return };
+        if !self.is_at(id, attempt) {
+            return self.in_routine(context, event);
+        }
+        let Some(state) = self.graph.get(id).map(|instance| instance.state) else { return };
+        let timer = Timer::Timeout(id, attempt);
+        match context.program.state(state).annotations.timeout_s {
+            Some(_) if matches!(event, Event::Delayed { .. }) => self.waits.forget_timer(timer),
+            Some(limit_s) if !self.waits.has_timer(timer) => self.set_timer(context, limit_s, timer),
+            _ => {}
         }
     }
 

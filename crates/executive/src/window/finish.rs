@@ -260,6 +260,8 @@ impl Window {
             Event::Granted { instance, .. }
             | Event::Refused { instance, .. }
             | Event::Projected { instance, .. }
+            | Event::Delayed { instance, .. }
+            | Event::Given { instance, .. }
             | Event::Finished { instance, .. }
             | Event::Crashed { instance, .. }
             | Event::Answered { instance, .. } => *instance,

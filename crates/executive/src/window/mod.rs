@@ -116,6 +116,9 @@ pub(crate) struct Window {
     /// Instances that have assigned other values since the event came.
     #[serde(skip)]
     assigned_again: BTreeSet<InstanceId>,
+    /// Computing and sensing nodes that have come to their places since the event came.
+    #[serde(skip)]
+    just_come: BTreeSet<InstanceId>,
     /// Shared facts that regions have changed and of which the regions beside them were not told yet.
     #[serde(skip)]
     crossings: Vec<Crossing>,
@@ -148,6 +151,7 @@ impl Window {
             is_ending: false,
             may_end_waits: false,
             assigned_again: BTreeSet::new(),
+            just_come: BTreeSet::new(),
             crossings: Vec::new(),
             followed: 0,
         }
@@ -163,6 +167,7 @@ impl Window {
     pub(crate) fn before(&mut self, context: &mut Context<'_>, event: &Event) -> Option<End> {
         self.followed = 0;
         self.assigned_again.clear();
+        self.just_come.clear();
         match event {
             Event::Answered { instance, choice } => {
                 self.answer(context, *instance, choice);
@@ -189,6 +194,7 @@ impl Window {
         match event {
             Event::Granted { .. } | Event::Refused { .. } | Event::Projected { .. } => self.answered(context, event),
             Event::Finished { .. } | Event::Crashed { .. } => self.attempt_ended(context, event),
+            event @ (Event::Delayed { .. } | Event::Given { .. }) => self.given(context, event),
             Event::Improved { instance, attempt, outputs, .. } => self.improved(context, instance, attempt, outputs),
             Event::RetirementFailed { reason, .. } => {
                 self.stop(context, ABORTED, format!("what had happened could not be recorded: {reason}"));

@@ -5,6 +5,7 @@ use super::Window;
 use super::graph::instance::{Instance, Node, Status};
 use super::memory::Seen;
 use super::ready::{self, Readiness, not_bound};
+use super::waits::Wait;
 use crate::binding;
 use crate::context::Context;
 use ratn_model::id::InstanceId;
@@ -21,7 +22,12 @@ impl Window {
             // Without earlier tries there is no backoff.
             self.waits.enqueue(&mut self.graph, id);
         }
+        // It keeps out of nobody's way any more.
+        if self.graph.get(id).is_some_and(|instance| matches!(instance.waiting.wait(), Wait::Writer(_))) {
+            self.waits.enqueue(&mut self.graph, id);
+        }
         self.graph.come_to_its_place(id);
+        self.just_come.insert(id);
         let is_under_way = self.graph.get(id).is_some_and(Instance::is_under_way);
         if is_under_way && let Some(Readiness::Failed(reason)) = self.unmet(context, id) {
             self.stop_node(context, id);
@@ -54,6 +60,12 @@ impl Window {
     /// Whether a node is under way where the sequential program would also be at it: everything before it in its region has ended, and what runs ahead
     /// has had its turn since. Then it goes on, whatever others change meanwhile: of a routine the parts that have not begun find the changes.
     pub(super) fn goes_on(&mut self, context: &Context<'_>, id: InstanceId) -> bool {
+        if self.only_asks(context, id) {
+            // It comes to its place once more, with what it finds then.
+            self.just_come.remove(&id);
+            self.graph.leave_its_place(id);
+            return false;
+        }
         let is_at_its_place = self.graph.get(id).is_some_and(|instance| {
             let has_come = instance.is_pia() || instance.node().is_some_and(|node| node.is_at_its_place);
             has_come && instance.is_head && instance.is_under_way() && self.older_beside(instance).is_none()
@@ -62,6 +74,15 @@ impl Window {
             routine.project_anew(context.root);
         }
         is_at_its_place
+    }
+
+    /// Whether the sequential program only asks for a node's resources at present, and looks at the world when it has them: the node has run ahead, has
+    /// its resources, and has come to its place in this event.
+    fn only_asks(&self, context: &Context<'_>, id: InstanceId) -> bool {
+        let has_resources = |instance: &Instance| instance.node().is_some_and(|node| node.status.since().is_some());
+        let asks = |instance: &Instance| !context.plan.state(instance.state).requirements.is_empty();
+        self.just_come.contains(&id)
+            && self.graph.get(id).is_some_and(|instance| has_resources(instance) && asks(instance))
     }
 
     fn may_come_to_its_place(&self, instance: &Instance) -> bool {

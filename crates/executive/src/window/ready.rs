@@ -124,11 +124,14 @@ impl Window {
         Readiness::Ready(requirements, bound)
     }
 
-    /// Keeps sensing nodes and nodes that change the sensed facts apart; the older one goes first.
+    /// Keeps sensing nodes and nodes that change the sensed facts apart; the older one goes first. Concurrent regions have no order: there a sensing node
+    /// that runs ahead keeps out of the way of motions, and one at its place looks beside them, as in the sequential program.
     fn keep_out_of_the_way(&self, context: &Context<'_>, instance: &Instance, view: &View<'_>) -> Option<Wait> {
         let others = || self.dispatch.active().filter(|id| *id != instance.id).filter_map(|id| self.graph.get(id));
         match instance.node()?.nature {
             NodeNature::Computes => None,
+            // Everything older has ended.
+            NodeNature::Senses if instance.node().is_some_and(|node| node.is_at_its_place) => None,
             NodeNature::Senses => {
                 let senses = FactExpr::footprint(&context.plan.state(instance.state).senses, view);
                 let writes = |other: &Instance| self.touches(context, other).writes.overlaps(&senses);
@@ -146,7 +149,9 @@ impl Window {
                 sensing.peek()?;
                 let writes = self.touches(context, instance).writes;
                 let looking = sensing.find(|other| {
-                    !self.graph.is_speculative(other.segment) && self.senses(context, other).overlaps(&writes)
+                    !self.graph.is_speculative(other.segment)
+                        && is_in_order(other, instance)
+                        && self.senses(context, other).overlaps(&writes)
                 });
                 looking.map(|other| Wait::Sensing(other.id))
             }

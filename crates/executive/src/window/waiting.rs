@@ -38,7 +38,7 @@ impl Window {
         if awaited == Awaited::Time && until.is_some_and(|until| until <= now) {
             return self.has_waited(context, id, awaiting::is_up(state));
         }
-        self.graph.run(id);
+        self.graph.run(id, now);
         if let Some(until) = until {
             self.waits.set_timer_at(until, Timer::Timeout(id, attempt));
             context.commands.push(Command::Wake { at: until });

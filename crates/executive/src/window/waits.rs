@@ -255,6 +255,16 @@ impl Waits {
         self.timers.remove(&(at, timer));
     }
 
+    /// Whether a timer is set, for any moment.
+    pub(crate) fn has_timer(&self, timer: Timer) -> bool {
+        self.timers.iter().any(|(_, set)| *set == timer)
+    }
+
+    /// Removes a timer, whatever moment it is set for.
+    pub(crate) fn forget_timer(&mut self, timer: Timer) {
+        self.timers.retain(|(_, set)| *set != timer);
+    }
+
     /// Checks, when the queue is empty, that every waiting instance is registered with the one that it waits for.
     pub(crate) fn check_invariants(&self, graph: &Graph) -> Result<(), String> {
         for instance in graph.iter() {

@@ -166,7 +166,11 @@ impl Timeline {
             | Event::AbortRequested { .. } => Cause::Operator,
             Event::Signalled { signal, .. } => Cause::Signal(signal.as_str().into()),
             // These events change nothing.
-            Event::Progressed { .. } | Event::Recorded { .. } | Event::SessionLost { .. } => return,
+            Event::Progressed { .. }
+            | Event::Delayed { .. }
+            | Event::Given { .. }
+            | Event::Recorded { .. }
+            | Event::SessionLost { .. } => return,
         };
         match event {
             Event::Started { task, mode, parameters, seed, capacity, breakpoints, origin, .. } => {
@@ -218,6 +222,8 @@ impl Timeline {
             Event::BreakpointsSet { states } => self.breakpoints.clone_from(states),
             Event::Projected { .. }
             | Event::Progressed { .. }
+            | Event::Delayed { .. }
+            | Event::Given { .. }
             | Event::Recorded { .. }
             | Event::SessionLost { .. }
             | Event::WorldChanged { .. }
@@ -476,6 +482,8 @@ fn instance_of(event: &Event) -> Option<InstanceId> {
         | Event::Refused { instance, .. }
         | Event::Projected { instance, .. }
         | Event::Progressed { instance, .. }
+        | Event::Delayed { instance, .. }
+        | Event::Given { instance, .. }
         | Event::Finished { instance, .. }
         | Event::Improved { instance, .. }
         | Event::Crashed { instance, .. }

@@ -7,6 +7,7 @@ use crate::ledger::Confirmed;
 use crate::readable::{one_line, readable};
 use crate::record::said;
 use crate::safe_on_disk::Mark;
+use futures::FutureExt;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, Revision};
@@ -164,7 +165,7 @@ impl Performing {
             }
         }
         // A goal that was given before is looked for first.
-        if given == Given::Now && !(self.is_its_turn().await && self.sees_what_was_decided().await) {
+        if given == Given::Now && !self.may_be_given().await {
             return None;
         }
         // One that was given before has to hear that it is cancelled.
@@ -175,6 +176,31 @@ impl Performing {
             Ok(endpoint) => self.execute(endpoint, given).await,
             Err(reason) => Some(self.aborted(reason.clone())),
         }
+    }
+
+    /// Waits until the goals that have to end first have ended and the root has every earlier decision; the goal's timeout does not count meanwhile.
+    /// Returns whether the goal may be given.
+    async fn may_be_given(&self) -> bool {
+        let mut waiting = std::pin::pin!(async { self.is_its_turn().await && self.sees_what_was_decided().await });
+        if let Some(may) = waiting.as_mut().now_or_never() {
+            return may;
+        }
+        self.counts(false).await;
+        let may = waiting.await;
+        if may {
+            self.counts(true).await;
+        }
+        may
+    }
+
+    /// Tells the executive whether the goal's timeout counts.
+    async fn counts(&self, counts: bool) {
+        if self.timeout_s.is_none() || self.stop.is_cancelled() {
+            return;
+        }
+        let (instance, attempt) = (self.instance, self.attempt);
+        let event = if counts { Event::Given { instance, attempt } } else { Event::Delayed { instance, attempt } };
+        let _ = self.events.send(event.into()).await;
     }
 
     /// Waits for the end of the goals that have to end first; returns whether the goal may be given.
@@ -264,6 +290,7 @@ impl Performing {
     }
 
     async fn found(&self, endpoint: &Endpoint) -> Event {
+        self.counts(true).await;
         let fate = self.actions.attach_hearing(endpoint, self.goal.clone(), |said| self.said(said)).await;
         match fate.inspect(|fate| self.heard(fate)) {
             Ok(fate) if fate.orphaned => {
@@ -273,11 +300,7 @@ impl Performing {
             Err(error) if error.is_unreadable() => self.unreadable(endpoint, &error).await,
             // Task control was killed after it logged that it gives the goal, and before it gave it.
             Err(error)
-                if error.code() == Some(tonic::Code::NotFound)
-                    && self.would_be_known(endpoint).await
-                    && self.is_its_turn().await
-                    && self.sees_what_was_decided().await
-                    && !self.stop.is_cancelled() =>
+                if error.code() == Some(tonic::Code::NotFound) && self.may_be_given_after_all(endpoint).await =>
             {
                 self.given(endpoint).await
             }
@@ -287,6 +310,17 @@ impl Performing {
             Err(error) if error.code() == Some(tonic::Code::Unimplemented) => self.left_alone(endpoint).await,
             Err(error) => self.lost(endpoint, &error).await,
         }
+    }
+
+    /// Whether the goal may be given, although task control was killed when it had logged that it gives it.
+    async fn may_be_given_after_all(&self, endpoint: &Endpoint) -> bool {
+        self.counts(false).await;
+        let is_new = self.would_be_known(endpoint).await;
+        let may = is_new && self.is_its_turn().await && self.sees_what_was_decided().await && !self.stop.is_cancelled();
+        if may {
+            self.counts(true).await;
+        }
+        may
     }
 
     /// A goal that may be under way at a worker that keeps none of its goals, because it implements no `Attach`: it is told to stop.

@@ -121,7 +121,7 @@ pub(crate) struct Held {
     #[serde(with = "leases")]
     pub(crate) lease: Option<Box<Lease>>,
     pub(crate) projection: Option<ProjectionId>,
-    /// When it got its resources.
+    /// When it got its resources; while it runs, when its goal or its wait began.
     pub(crate) since: Timestamp,
 }
 
@@ -298,7 +298,7 @@ impl Status {
         matches!(self, Status::Running(_) | Status::RunningRoutine(..))
     }
 
-    /// When it got its resources.
+    /// When it got its resources or, while its goal or its wait is under way, when that began.
     pub(crate) fn since(&self) -> Option<Timestamp> {
         match self {
             Status::Granted(held) | Status::Projecting(held) | Status::Running(held) => Some(held.since),

@@ -50,11 +50,11 @@ impl Graph {
         }
     }
 
-    /// Running: the goal is under way.
-    pub(crate) fn run(&mut self, id: InstanceId) {
+    /// Running: the goal, or the wait, begins now.
+    pub(crate) fn run(&mut self, id: InstanceId, now: Timestamp) {
         if let Some(node) = self.node_mut(id) {
             let held = node.status.take_held();
-            node.status = Status::Running(held);
+            node.status = Status::Running(Held { since: now, ..held });
         }
     }
 
@@ -145,6 +145,13 @@ impl Graph {
     pub(crate) fn come_to_its_place(&mut self, id: InstanceId) {
         if let Some(node) = self.node_mut(id) {
             node.is_at_its_place = true;
+        }
+    }
+
+    /// The node is not at its place yet after all.
+    pub(crate) fn leave_its_place(&mut self, id: InstanceId) {
+        if let Some(node) = self.node_mut(id) {
+            node.is_at_its_place = false;
         }
     }
 

@@ -137,6 +137,28 @@ async fn a_worker_that_hangs_ends_at_the_goals_timeout() -> anyhow::Result<()> {
 }
 
 #[tokio::test]
+async fn the_timeout_of_a_goal_does_not_count_before_it_is_given() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    // Nothing is before it.
+    bench.performing("work", Some(5.0), 0).perform(Given::Now).await;
+    assert!(matches!(bench.event().await, Some(Event::Finished { .. })));
+    // A goal that was told to stop, and what was decided and is not in the root yet.
+    let (earlier, root) = (CancellationToken::new(), watch::channel(Confirmed::default()));
+    let mut performing = bench.performing("hang", Some(5.0), 0);
+    performing.before.push(earlier.clone());
+    performing.sees = Some((root.1, Revision(3)));
+    let performed = tokio::spawn(performing.perform(Given::Now));
+    assert!(matches!(bench.event().await, Some(Event::Delayed { instance: InstanceId(1), attempt: 1 })));
+    earlier.cancel();
+    tokio::task::yield_now().await;
+    assert!(bench.answers.try_recv().is_err(), "the root is not there yet");
+    root.0.send_replace(Confirmed { commit: Revision(3), ..Confirmed::default() });
+    assert!(matches!(bench.event().await, Some(Event::Given { instance: InstanceId(1), attempt: 1 })));
+    assert!(matches!(bench.event().await, Some(Event::Finished { .. })));
+    Ok(performed.await?)
+}
+
+#[tokio::test]
 async fn a_goal_of_before_is_found_and_not_given_again() -> anyhow::Result<()> {
     let mut bench = Bench::new().await?;
     // The goal was never given: its fate is unknown, and it is not begun.
