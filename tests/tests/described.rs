@@ -1,4 +1,5 @@
-//! What a worker says of itself is known on the pages of `ratn dashboard` that stand open, as it is to `ratn check` and `ratn run`.
+//! What a worker says of itself is known on the pages of `ratn dashboard` that stand open, as it is to `ratn check` and `ratn run`, which starts
+//! the system of its config for that.
 
 mod support;
 
@@ -9,10 +10,14 @@ use ratn_worker::worker::{Worker, WorkerOptions};
 use serde_json::Value as Json;
 use std::io::{Read, Write};
 use std::net::TcpStream;
-use support::{Place, wait_for};
+use support::{Place, repository, texts, wait_for};
 use tokio_util::sync::CancellationToken;
 
 const TASK: &str = "task: greet\nstates:\n  - hello: { action: greeter/greet, in: { n: 2 }, resources: [Greeter] }\n";
+
+/// The variables that make [`greeter`] a worker: its id, and the file that it writes its endpoint to.
+const ID: &str = "TEST_GREETER_ID";
+const ENDPOINT_FILE: &str = "TEST_GREETER_ENDPOINT_FILE";
 
 /// `greeter/greet`, which no catalogue has.
 struct Greet;
@@ -30,6 +35,49 @@ impl Action for Greet {
     async fn execute(&self, _: GoalContext) -> ActionResult {
         Ok(GoalOutcome::success())
     }
+}
+
+/// The role of a program that a config starts. As a test it does nothing.
+#[test]
+fn greeter() -> anyhow::Result<()> {
+    let Some(file) = std::env::var_os(ENDPOINT_FILE) else { return Ok(()) };
+    let options = WorkerOptions {
+        id: std::env::var(ID)?,
+        kind: "Greeter".to_owned(),
+        endpoint_file: Some(file.into()),
+        exit_with_parent: true,
+        ..WorkerOptions::default()
+    };
+    let worker = Worker::new(options).provides("greeter", "Greeter").action(Greet);
+    Ok(tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(worker.run())?)
+}
+
+/// No system runs, the catalogue does not have the action, and nobody could simulate the robot.
+#[test]
+fn a_run_starts_the_workers_of_its_config_that_describe_themselves_and_no_cell_for_a_robot_without_a_workplace()
+-> anyhow::Result<()> {
+    let place = Place::new()?;
+    for file in ["panda.urdf", "panda.srdf", "panda.toml"] {
+        std::fs::copy(repository("crates/motion/robots").join(file), place.path().join(file))?;
+    }
+    let robot = place.path().join("panda.toml");
+    let whole = std::fs::read_to_string(&robot)?;
+    std::fs::write(&robot, whole.split("[workplace]").next().context("a text")?)?;
+    let (task, config) = (place.path().join("task.yaml"), place.path().join("ratn.toml"));
+    std::fs::write(&task, TASK)?;
+    let program = std::env::current_exe()?;
+    let text = format!(
+        "robot = \"panda.toml\"\n[[process-manager.template]]\nname = \"greeter\"\nkind = \"Greeter\"\nprogram = {program:?}\n\
+         args = [\"--exact\", \"greeter\", \"--nocapture\"]\nenv = {{ {ID} = \"{{id}}\", {ENDPOINT_FILE} = \"{{endpoint_file}}\" }}\n"
+    );
+    std::fs::write(&config, text)?;
+    let path = |path: &std::path::Path| path.to_str().map(str::to_owned).context("a path");
+    let log = place.path().join("log.jsonl");
+    let arguments = ["run", &path(&task)?, "--config", &path(&config)?, "--log", &path(&log)?];
+    let output = place.ratn(&arguments).output()?;
+    let (out, err) = texts(&output);
+    ensure!(output.status.success() && err.contains("starting one for this run"), "{out}{err}");
+    place.wait_until_empty()
 }
 
 #[test]

@@ -600,15 +600,15 @@ impl Oracle for Looking {
 #[test]
 fn no_fingers_come_down_on_a_box_that_somebody_moved_before_the_arm_set_out_for_it() {
     // As the arm carries the first box: then a picture of the second one that was taken before is out of date. As the way to the second one is
-    // planned: so is every picture. A look that ends behind the motion comes too late; that ends well, too. Of the last box nothing is left to be
-    // forgotten that keeps the next picture from being taken before the arm has left.
+    // planned: so is every picture. A look that takes longer than the motion beside it is waited for above the box. Of the last box nothing is left
+    // to be forgotten that keeps the next picture from being taken before the arm has left.
     let second = (1, 0.04);
     for (occasion, moved, look_s) in [
-        (("motion", 3), second, 1.0),
-        (("plan", 4), second, 1.0),
-        (("plan", 4), second, 5.0),
-        (("motion", 6), (2, 0.06), 1.0),
-        (("plan", 7), (2, 0.06), 1.0),
+        (("motion", 4), second, 1.0),
+        (("plan", 5), second, 1.0),
+        (("plan", 5), second, 5.0),
+        (("motion", 8), (2, 0.06), 1.0),
+        (("plan", 9), (2, 0.06), 1.0),
     ] {
         let mishaps = Mishaps { moved: BTreeMap::from([(occasion, moved)]), ..Mishaps::default() };
         for mode in MODES {
@@ -619,7 +619,7 @@ fn no_fingers_come_down_on_a_box_that_somebody_moved_before_the_arm_set_out_for_
             let run = perform_with("fetch_boxes_recovering", mode, &boxes, &mut looking, |looking| &mut looking.0);
             let case = format!("{occasion:?}, {look_s} s, {mode:?}");
             assert_eq!((run.outcome.as_str(), delivered(&looking.0)), ("success", 3), "{case}: {}", run.reason);
-            assert!(looking.0.hits == 0 || look_s > 2.5, "{case}");
+            assert_eq!(looking.0.hits, 0, "{case}");
             assert_eq!(looking.2, 0, "{case}: the arm was in the picture");
         }
     }
@@ -629,11 +629,11 @@ fn no_fingers_come_down_on_a_box_that_somebody_moved_before_the_arm_set_out_for_
 fn no_fingers_come_down_on_what_is_to_be_set_and_somebody_moved_before_the_arm_set_out_for_it() {
     // As above: as the arm carries the first thing, and as the way to another one is planned.
     for (occasion, moved, look_s) in [
-        (("motion", 3), (1, 0.04), 1.0),
-        (("plan", 4), (1, 0.04), 1.0),
-        (("plan", 4), (1, 0.04), 9.0),
-        (("motion", 6), (2, 0.04), 1.0),
-        (("plan", 7), (2, 0.04), 1.0),
+        (("motion", 4), (1, 0.04), 1.0),
+        (("plan", 5), (1, 0.04), 1.0),
+        (("plan", 5), (1, 0.04), 9.0),
+        (("motion", 8), (2, 0.04), 1.0),
+        (("plan", 9), (2, 0.04), 1.0),
     ] {
         let mishaps = Mishaps { moved: BTreeMap::from([(occasion, moved)]), ..Mishaps::default() };
         for mode in MODES {
@@ -643,7 +643,7 @@ fn no_fingers_come_down_on_what_is_to_be_set_and_somebody_moved_before_the_arm_s
             let run = perform_with("set_table_recovering", mode, &wanted, &mut looking, |looking| &mut looking.0);
             let case = format!("{occasion:?}, {look_s} s, {mode:?}");
             assert_eq!((run.outcome.as_str(), set(&looking.0)), ("success", 3), "{case}: {}", run.reason);
-            assert!(looking.0.hits == 0 || look_s > 8.0, "{case}");
+            assert_eq!(looking.0.hits, 0, "{case}");
         }
     }
 }
@@ -681,8 +681,11 @@ fn a_camera_that_fails_is_asked_again_and_one_that_sees_that_the_object_is_gone_
     }
 }
 
+/// How much longer an approach in two motions is expected to take than one without a stop above the object, in seconds.
+const STOP_S: f64 = 0.3;
+
 #[test]
-fn the_look_beside_an_approach_takes_no_time() {
+fn the_look_beside_an_approach_takes_no_time_but_a_stop_above_the_object() {
     let boxes = [on_table(0), on_table(1), on_table(2)];
     let table = [bowl(0), bowl(1), fork(0)];
     for mode in MODES {
@@ -692,9 +695,12 @@ fn the_look_beside_an_approach_takes_no_time() {
             run.end_s
         };
         let fetches = |task| lasts(task, &[("boxes", 3)], &boxes);
-        assert_eq!(fetches("fetch_boxes_watched"), fetches("fetch_boxes"), "{mode:?}");
         let sets = |task| lasts(task, &[("bowls", 2), ("forks", 1)], &table);
-        assert_eq!(sets("set_table_watched"), sets("set_table"), "{mode:?}");
+        let more_s = [
+            fetches("fetch_boxes_watched") - fetches("fetch_boxes"),
+            sets("set_table_watched") - sets("set_table"),
+        ];
+        assert!(more_s.iter().all(|more_s| (0.0..3.0 * STOP_S + 1e-6).contains(more_s)), "{mode:?}: {more_s:?}");
     }
 }
 
