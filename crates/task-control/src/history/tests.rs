@@ -132,7 +132,7 @@ fn a_checkpoint_that_is_torn_or_damaged_anywhere_is_not_used() {
     // Of an older or newer format version.
     std::fs::write(bench.checkpoint(), &whole).unwrap();
     rewrite(&bench.checkpoint(), |bytes| bytes[16] += 1);
-    assert!(find().unwrap_err().to_string().contains("of format 9"));
+    assert!(find().unwrap_err().to_string().contains("of format 10"));
     assert_eq!(bench.resumes_behind(), 0);
 }
 
