@@ -696,10 +696,8 @@ fn the_look_beside_an_approach_takes_no_time_but_a_stop_above_the_object() {
         };
         let fetches = |task| lasts(task, &[("boxes", 3)], &boxes);
         let sets = |task| lasts(task, &[("bowls", 2), ("forks", 1)], &table);
-        let more_s = [
-            fetches("fetch_boxes_watched") - fetches("fetch_boxes"),
-            sets("set_table_watched") - sets("set_table"),
-        ];
+        let more_s =
+            [fetches("fetch_boxes_watched") - fetches("fetch_boxes"), sets("set_table_watched") - sets("set_table")];
         assert!(more_s.iter().all(|more_s| (0.0..3.0 * STOP_S + 1e-6).contains(more_s)), "{mode:?}: {more_s:?}");
     }
 }

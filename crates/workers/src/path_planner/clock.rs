@@ -10,12 +10,17 @@ use super::outputs;
 use ratn_model::value::Value;
 use ratn_motion::pace::{Control, Progress};
 use ratn_worker::action::GoalContext;
+use rustix::time::{ClockId, clock_gettime};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Maximum wall time of the search for a first path, unless the budget is longer.
+/// Maximum processor time of the search for a first path, unless the budget is longer: whether a path is found does not depend on what else the
+/// machine does, …
 const FIRST_PATH_LIMIT: Duration = Duration::from_secs(10);
+
+/// … and its maximum wall time, where it hardly gets a processor.
+const FIRST_PATH_LONGEST: Duration = Duration::from_secs(60);
 
 /// Minimum wall time of improvement without a budget: the processor needs it, however fast robot time goes. After that, improvement goes on
 /// as long as the motion got quicker in the last interval of this length by more than the interval took.
@@ -118,7 +123,7 @@ impl Clock {
         }
         match (self.first_path, self.budget) {
             (Some(_), Some(budget)) if elapsed < budget => Control::Continue,
-            (None, budget) if elapsed < budget.unwrap_or_default().max(FIRST_PATH_LIMIT) => Control::Continue,
+            (None, budget) if is_searched_on(elapsed, processor_time(), budget) => Control::Continue,
             (Some(first_path), None) if elapsed < first_path + IMPROVEMENT || self.is_worth_waiting(elapsed) => {
                 Control::Continue
             }
@@ -143,5 +148,40 @@ impl Clock {
     pub(super) fn figures(&self) -> Figures {
         let planning_s = self.begin.elapsed().as_secs_f64() * self.speed;
         Figures { first_path_s: self.first_path.map_or(planning_s, |t| t.as_secs_f64() * self.speed), planning_s }
+    }
+}
+
+/// Whether the search for a first path goes on after so much wall time, of which the planner had a processor for `computed`.
+fn is_searched_on(elapsed: Duration, computed: Duration, budget: Option<Duration>) -> bool {
+    let is_within_limits = computed < FIRST_PATH_LIMIT && elapsed < FIRST_PATH_LONGEST;
+    is_within_limits || budget.is_some_and(|budget| elapsed < budget)
+}
+
+/// The processor time of this thread, which plans for one goal alone.
+fn processor_time() -> Duration {
+    Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_first_path_is_searched_for_ten_seconds_of_a_processor_however_busy_the_machine_is() {
+        let goes_on = |elapsed_s, computed_s, budget_s: Option<u64>| {
+            let [elapsed, computed] = [elapsed_s, computed_s].map(Duration::from_secs);
+            is_searched_on(elapsed, computed, budget_s.map(Duration::from_secs))
+        };
+        assert!(goes_on(9, 9, None) && !goes_on(10, 10, None));
+        assert!(goes_on(30, 2, None) && goes_on(30, 2, Some(5)), "it waits for a processor");
+        assert!(!goes_on(60, 2, None), "somebody waits for the answer");
+        assert!(goes_on(70, 70, Some(80)) && !goes_on(80, 70, Some(80)));
+    }
+
+    #[test]
+    fn time_without_a_processor_is_not_counted() {
+        let before = processor_time();
+        std::thread::sleep(Duration::from_millis(50));
+        assert!(processor_time().saturating_sub(before) < Duration::from_millis(50));
     }
 }
