@@ -7,7 +7,6 @@ use crate::ledger::Confirmed;
 use crate::readable::{one_line, readable};
 use crate::record::said;
 use crate::safe_on_disk::Mark;
-use futures::FutureExt;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, Revision};
@@ -54,6 +53,8 @@ const DEADLINE_SLACK: Duration = Duration::from_millis(500);
 /// Maximum number of intermediate results of one goal; each is a line of the event log.
 const MOST_RESULTS: u32 = 256;
 
+/// What has to be waited for no longer than this before a goal is given is not told to the executive.
+const HARDLY: Duration = Duration::from_millis(20);
 /// Interval, beside other runs, at which to check whether a goal has given its first result.
 const LOOK_AGAIN: Duration = Duration::from_millis(20);
 
@@ -134,7 +135,7 @@ pub(super) fn deadline_ms(timeout_s: Option<f64>, speed: f64) -> u64 {
 
 impl Performing {
     /// Performs the goal until its end; sends the event to the shell, unless the goal was cancelled.
-    pub(super) async fn perform(mut self, given: Given) {
+    pub(super) async fn perform(self, given: Given) {
         // One that was given before may be under way, whether or not it is found.
         self.may_move.store(given != Given::Now, Ordering::Release);
         let mut event = self.ended(given).await;
@@ -154,16 +155,7 @@ impl Performing {
     }
 
     /// The end of the goal; `None` if it was cancelled.
-    async fn ended(&mut self, given: Given) -> Option<Event> {
-        if let Some(safe) = self.safe.take() {
-            tokio::select! {
-                biased;
-                () = self.stop.cancelled() => return None,
-                () = self.over.cancelled() => return None,
-                // If it never will be, the run ends.
-                is_safe = safe.safe() => if !is_safe { return None },
-            }
-        }
+    async fn ended(&self, given: Given) -> Option<Event> {
         // A goal that was given before is looked for first.
         if given == Given::Now && !self.may_be_given().await {
             return None;
@@ -178,11 +170,13 @@ impl Performing {
         }
     }
 
-    /// Waits until the goals that have to end first have ended and the root has every earlier decision; the goal's timeout does not count meanwhile.
-    /// Returns whether the goal may be given.
+    /// Waits until the log says on disk that the goal is given, the goals that have to end first have ended, and the root has every earlier decision; the
+    /// goal's timeout does not count meanwhile, if that takes longer than [`HARDLY`]. Returns whether the goal may be given.
     async fn may_be_given(&self) -> bool {
-        let mut waiting = std::pin::pin!(async { self.is_its_turn().await && self.sees_what_was_decided().await });
-        if let Some(may) = waiting.as_mut().now_or_never() {
+        let mut waiting = std::pin::pin!(async {
+            self.is_safe_on_disk().await && self.is_its_turn().await && self.sees_what_was_decided().await
+        });
+        if let Ok(may) = tokio::time::timeout(HARDLY, waiting.as_mut()).await {
             return may;
         }
         self.counts(false).await;
@@ -201,6 +195,18 @@ impl Performing {
         let (instance, attempt) = (self.instance, self.attempt);
         let event = if counts { Event::Given { instance, attempt } } else { Event::Delayed { instance, attempt } };
         let _ = self.events.send(event.into()).await;
+    }
+
+    /// Waits until the log is on disk; returns whether the goal may be given.
+    async fn is_safe_on_disk(&self) -> bool {
+        let Some(safe) = self.safe.clone() else { return true };
+        tokio::select! {
+            biased;
+            () = self.stop.cancelled() => false,
+            () = self.over.cancelled() => false,
+            // If it never will be, the run ends.
+            is_safe = safe.safe() => is_safe,
+        }
     }
 
     /// Waits for the end of the goals that have to end first; returns whether the goal may be given.

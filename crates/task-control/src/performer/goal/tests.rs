@@ -142,13 +142,16 @@ async fn the_timeout_of_a_goal_does_not_count_before_it_is_given() -> anyhow::Re
     // Nothing is before it.
     bench.performing("work", Some(5.0), 0).perform(Given::Now).await;
     assert!(matches!(bench.event().await, Some(Event::Finished { .. })));
-    // A goal that was told to stop, and what was decided and is not in the root yet.
+    // The log, a goal that was told to stop, and what was decided and is not in the root yet.
     let (earlier, root) = (CancellationToken::new(), watch::channel(Confirmed::default()));
+    let (disk, slow) = Mark::not_yet();
     let mut performing = bench.performing("hang", Some(5.0), 0);
+    performing.safe = Some(slow);
     performing.before.push(earlier.clone());
     performing.sees = Some((root.1, Revision(3)));
     let performed = tokio::spawn(performing.perform(Given::Now));
     assert!(matches!(bench.event().await, Some(Event::Delayed { instance: InstanceId(1), attempt: 1 })));
+    disk.send_replace(1);
     earlier.cancel();
     tokio::task::yield_now().await;
     assert!(bench.answers.try_recv().is_err(), "the root is not there yet");
