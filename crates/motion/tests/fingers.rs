@@ -155,7 +155,7 @@ fn fingers_are_around_what_they_hold_however_it_lies_in_them() {
     let can = Shape::Cylinder { radius: 0.02, length: 0.1 };
     let quarter = std::f64::consts::FRAC_PI_2;
     for (shape, turned_rad, finger) in
-        [(can.clone(), 0.0, 0.02), (can, quarter, 0.05), (Shape::Box { size: [0.03, 0.04, 0.1] }, quarter, 0.05)]
+        [(can, 0.0, 0.02), (can, quarter, 0.05), (Shape::Box { size: [0.03, 0.04, 0.1] }, quarter, 0.05)]
     {
         assert!((held(shape, turned_rad) - finger).abs() < 1e-9, "{turned_rad}");
     }

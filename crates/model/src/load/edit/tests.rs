@@ -147,11 +147,11 @@ fn only_the_lines_of_the_key_change_in_every_state_of_every_example() {
                     let Some(mut other) = program(&after) else { continue };
                     loaded += 1;
                     for (one, other) in before.states.iter().zip(&mut other.states) {
-                        // `exceptions` of a state also hold for the states inside.
+                        // `exceptions` of a state also hold for the states inside, and what it reads gives them a projection.
                         let is_inside = one.path.starts_with(&format!("{}/", state.path));
                         if one.path == state.path
                             || one.path == format!("{}/try", state.path)
-                            || (*key == "exceptions" && is_inside)
+                            || (matches!(*key, "exceptions" | "reads") && is_inside)
                         {
                             other.annotations = one.annotations.clone();
                         }
