@@ -178,6 +178,25 @@ fn a_look_ahead_plans_with_what_is_left_of_everything_and_with_what_waits_for_wh
 }
 
 #[test]
+fn a_look_ahead_plans_regions_behind_what_is_before_them_and_before_what_is_behind_them() {
+    let go = |name: &str| {
+        format!("{name}: {{ action: arm/move, pia: true, reads: [], effects: [], resources: [{{ block: Arm }}] }}")
+    };
+    let beside =
+        format!("  - both: {{ concurrency: barrier, regions: [ {{ {} }}, {{ {} }} ] }}\n", go("left"), go("right"));
+    let states = [format!("  - {}\n", go("before")), beside, format!("  - {}\n", go("behind"))];
+    let mut begun = Begun::of(&task(&states), &[]);
+    let [before, left, right, behind] =
+        ["before", "both/left", "both/right", "behind"].map(|path| begun.planned(0, path));
+    let places: Vec<InstanceId> =
+        begun.executive.outlook(Timestamp::default()).tasks.iter().map(|task| task.instance).collect();
+    let after = |task: &Task| task.after.iter().map(|place| places[*place]).collect::<Vec<InstanceId>>();
+    assert_eq!(after(&before), []);
+    assert_eq!([after(&left), after(&right)], [vec![before.instance], vec![before.instance]]);
+    assert_eq!(after(&behind), [left.instance, right.instance]);
+}
+
+#[test]
 fn what_a_look_ahead_advises_stays_until_it_advises_otherwise() {
     let states = [think("first", "", "9"), think("second", "", "5")];
     let mut begun = Begun::of(&task(&states), &[]);

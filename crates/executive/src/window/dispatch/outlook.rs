@@ -2,7 +2,7 @@
 
 use super::{DEFAULT_DURATION_S, Dispatch, blocks};
 use crate::lookahead::{Problem, Task};
-use crate::window::graph::instance::{Instance, LineId};
+use crate::window::graph::instance::{Instance, LineId, Role};
 use crate::window::memory::Sight;
 use ratn_model::id::InstanceId;
 use ratn_model::time::Timestamp;
@@ -19,12 +19,30 @@ impl Dispatch {
         let graph = sight.graph;
         let mut places: BTreeMap<InstanceId, usize> = BTreeMap::new();
         let mut tasks: Vec<Task> = Vec::new();
-        // Per line, the last PIA and the tasks since then: the next PIA waits for all of them.
+        // Per line, the last PIA and the tasks since then: the next PIA waits for all of them. A region begins with those before its fork; behind a
+        // join stand those of all its regions.
         let mut since: BTreeMap<LineId, Vec<usize>> = BTreeMap::new();
-        let is_open = |instance: &&Instance| {
-            instance.role().is_none() && instance.ended().is_none() && graph.is_likeliest(instance.segment)
-        };
-        for instance in graph.iter().filter(is_open).take(MAX_TASKS) {
+        let (mut at_forks, mut at_joins) = (BTreeMap::new(), BTreeMap::<InstanceId, Vec<usize>>::new());
+        for instance in graph.iter().filter(|instance| graph.is_likeliest(instance.segment)) {
+            if let Some((fork, _)) = graph.region(instance.line).filter(|_| !since.contains_key(&instance.line)) {
+                since.insert(instance.line, at_forks.get(&fork).cloned().unwrap_or_default());
+            }
+            let line = since.entry(instance.line).or_default();
+            match instance.role() {
+                Some(Role::Fork) => drop(at_forks.insert(instance.id, line.clone())),
+                Some(Role::RegionEnd) => {
+                    let join = graph.join_behind(instance.line);
+                    join.into_iter().for_each(|join| at_joins.entry(join).or_default().extend_from_slice(line));
+                }
+                Some(Role::Join) => *line = at_joins.remove(&instance.id).unwrap_or_default(),
+                _ => {}
+            }
+            if instance.role().is_some() || instance.ended().is_some() {
+                continue;
+            }
+            if tasks.len() == MAX_TASKS {
+                break;
+            }
             let began = instance.node().and_then(|node| node.status.since());
             let elapsed_s = began.map_or(0.0, |began| now.since(began).as_secs_f64());
             let mut after: Vec<usize> = Vec::new();
@@ -32,12 +50,11 @@ impl Dispatch {
                 after.extend(sight.producers_of(instance).filter_map(|producer| places.get(&producer)));
                 after.extend(instance.waiting.wait().on().and_then(|on| places.get(&on)));
                 if instance.is_pia() {
-                    after.extend(since.get(&instance.line).into_iter().flatten());
+                    after.extend_from_slice(line);
                 }
                 after.sort_unstable();
                 after.dedup();
             }
-            let line = since.entry(instance.line).or_default();
             if instance.is_pia() {
                 line.clear();
             }
