@@ -35,7 +35,7 @@ fn bounded(joint: &Joint, lower: f64, upper: f64) -> Joint {
     Joint { lower, upper, endless: false, ..joint.clone() }
 }
 
-/// Maximum number of goals for one posture of continuous joints.
+/// Maximum number of goals for one posture of continuous joints, unless it has that many such joints.
 const WAYS: usize = 16;
 
 /// For each goal that is offered, the joints that go the other way round to it, and their positions there. The goals are in the order of how much
@@ -49,7 +49,13 @@ fn ways_round(endless: &[usize], start: &[f64], nearest: &[f64]) -> Vec<Vec<(usi
         let also: Vec<_> = also.collect();
         ways.extend(also);
         ways.sort_by(|(a, _), (b, _)| a.total_cmp(b));
-        ways.truncate(WAYS);
+        // The nearest one, and those on which one joint alone goes round, always stay.
+        let (more, mut kept) = (WAYS.saturating_sub(1 + endless.len()), 0);
+        ways.retain(|(_, ways)| {
+            let is_always = ways.len() < 2;
+            kept += usize::from(!is_always);
+            is_always || kept <= more
+        });
     }
     ways.into_iter().map(|(_, ways)| ways).collect()
 }

@@ -16,7 +16,6 @@ use ratn_motion::arm::line;
 use ratn_motion::collision::{CONTACT_TOLERANCE_M, Checker, Contact, PADDING_M};
 use ratn_motion::description::DescriptionError;
 use ratn_motion::joint_vector::JointVector;
-use ratn_motion::reach::Target;
 use ratn_motion::robot::Robot;
 use ratn_motion::top_grasp::{APPROACH_M, grasp_poses};
 use ratn_motion::workplace::{Boxes, HOME, Slab, Workplace};
@@ -319,7 +318,7 @@ fn graspable(robot: &Robot, view: &Robot, setting: Setting, placed: &[Placed], w
     let mut random = ChaCha8Rng::seed_from_u64(0);
     placed[which].iter().filter(|object| object.model.slips_off().is_none()).all(|object| {
         grasps(object).iter().any(|grasp| {
-            reach.solutions(&Target::at(*grasp), &home, 6, 20, &mut random).iter().any(|posture| {
+            reach.solutions(&reach.target(*grasp), &home, 6, 20, &mut random).iter().any(|posture| {
                 line(&reach, posture, [0.0, 0.0, APPROACH_M]).is_ok_and(|postures| {
                     postures.iter().all(|p| checker.is_free(p, Contact::Gripper(CONTACT_TOLERANCE_M)))
                 })

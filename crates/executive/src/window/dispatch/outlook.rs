@@ -2,7 +2,7 @@
 
 use super::{DEFAULT_DURATION_S, Dispatch, blocks};
 use crate::lookahead::{Problem, Task};
-use crate::window::graph::instance::{Instance, LineId, Role};
+use crate::window::graph::instance::{LineId, Role};
 use crate::window::memory::Sight;
 use ratn_model::id::InstanceId;
 use ratn_model::time::Timestamp;
