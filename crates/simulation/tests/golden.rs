@@ -12,11 +12,11 @@ use ratn_executive::protocol::{Command, Event, LogEntry, Mode, Note};
 use ratn_model::fact::FactKey;
 use ratn_model::id::InstanceId;
 use ratn_model::load::Files;
-use ratn_model::program::Program;
+use ratn_model::program::{Nature, Program, StateKind};
 use ratn_model::resource::Quantity;
 use ratn_model::value::Value;
 use ratn_simulation::run::{Run, RunError};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -213,6 +213,41 @@ fn both_modes_end_alike() {
         }
     }
     assert!(different.is_empty(), "{} scenarios differ:\n{}", different.len(), different.join("\n"));
+}
+
+/// The next holder of what a motion held finds the world as the motion leaves it.
+#[test]
+fn no_motion_gives_back_what_it_holds_before_its_effects_are_real() {
+    let mut early = Vec::new();
+    for scenario in scenarios() {
+        for (mode, run, _) in &scenario.runs {
+            let Ok(run) = run else { continue };
+            let (mut motions, mut without) = (BTreeMap::new(), BTreeSet::new());
+            for line in &run.log {
+                match &line.entry {
+                    LogEntry::Command(Command::Note(Note::Expanded { instance, state, path, .. })) => {
+                        let state = scenario.program.state(*state);
+                        let is_action = matches!(state.kind, StateKind::Action { .. }) && !state.is_pause();
+                        if is_action && state.annotations.nature == Nature::Irreversible {
+                            motions.insert(*instance, path.clone());
+                        }
+                    }
+                    LogEntry::Command(Command::Release { instance, lease: Some(_), .. }) => {
+                        without.insert(*instance);
+                    }
+                    LogEntry::Event(Event::Granted { instance, .. }) => {
+                        without.remove(instance);
+                    }
+                    LogEntry::Command(Command::Commit { instance, .. }) if without.contains(instance) => {
+                        let motion = motions.get(instance).map(|path| format!("{} ({mode}): {path}", scenario.name()));
+                        early.extend(motion);
+                    }
+                    _ => {}
+                }
+            }
+        }
+    }
+    assert!(early.is_empty(), "they gave back too early: {early:?}");
 }
 
 /// The first line of the log that is otherwise when the executive is made anew from a checkpoint after every so many events.

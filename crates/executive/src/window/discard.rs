@@ -86,6 +86,11 @@ impl Window {
     /// Retires motions that have ended but were waiting for older ones beside them; their lines go on.
     fn make_done_real(&mut self, context: &mut Context<'_>) {
         let program = context.program;
+        let ends = self.graph.iter().filter_map(|one| Some((one.id, one.end_to_take()?.clone())));
+        for (id, end) in ends.collect::<Vec<_>>() {
+            let end = self.end_of_answer(context, id, end);
+            self.finish_now(context, id, end);
+        }
         let is_done = |head: &&Instance| {
             let has_acted = |node: &Node| node.has_acted && matches!(node.status, Status::Finished(_));
             head.is_pia() && !program.state(head.state).is_pause() && head.node().is_some_and(has_acted)

@@ -98,6 +98,8 @@ impl Window {
     /// Whether this attempt of an instance is running.
     fn is_at(&self, id: InstanceId, attempt: u32) -> bool {
         let is_running = |status: &Status| matches!(status, Status::Running(_));
-        self.graph.node(id).is_some_and(|node| node.attempt == attempt && is_running(&node.status))
+        let running = self.graph.get(id).filter(|instance| instance.end_to_take().is_none());
+        let node = running.and_then(|instance| instance.node());
+        node.is_some_and(|node| node.attempt == attempt && is_running(&node.status))
     }
 }

@@ -25,7 +25,8 @@ impl Window {
         if self.improving.is(id, attempt) {
             return self.improvement_ended(context, id);
         }
-        let node = self.graph.node(id).filter(|node| node.attempt == attempt);
+        let has_ended = self.graph.get(id).is_some_and(|instance| instance.end_to_take().is_some());
+        let node = self.graph.node(id).filter(|node| node.attempt == attempt && !has_ended);
         match (event, node.map(|node| &node.status)) {
             (Event::Finished { outcome, outputs, measured, evidence, reason, .. }, Some(Status::Running(_))) => {
                 let changes = Changed::Declared(measured, evidence);
@@ -70,9 +71,30 @@ impl Window {
         }
     }
 
-    /// A node's result is known: gives back its resources.
+    /// A node's result is known. The end of a motion that conflicts with an older one beside it is taken when that has ended, as if it had lasted
+    /// longer: its effects come behind those of the older one, and until they are real it holds its resources.
     pub(super) fn finish(&mut self, context: &mut Context<'_>, id: InstanceId, ended: Ended) {
-        let ended = self.end_of_answer(context, id, ended);
+        let end = self.end_of_answer(context, id, ended.clone());
+        let moves = |instance: &&Instance| {
+            instance.is_pia() && instance.node().is_some_and(|node| matches!(node.status, Status::Running(_)))
+        };
+        let motion = self.graph.get(id).filter(moves).filter(|_| !self.is_ending);
+        if let Some(older) = motion.and_then(|motion| self.conflict_of_end(context, motion, Some(&end))) {
+            self.graph.answer(id, ended);
+            return self.wait(id, Wait::World(older));
+        }
+        self.finish_now(context, id, end);
+    }
+
+    /// Takes the end of a motion that has waited for an older one.
+    pub(super) fn take_end(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        if let Some(end) = self.graph.get(id).and_then(Instance::end_to_take).cloned() {
+            self.finish(context, id, end);
+        }
+    }
+
+    /// The end of a node becomes its result, and its resources go back.
+    pub(super) fn finish_now(&mut self, context: &mut Context<'_>, id: InstanceId, ended: Ended) {
         context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
         let has_acted = self.graph.node(id).is_some_and(|node| node.status.is_running());
         self.give_back(context, id);

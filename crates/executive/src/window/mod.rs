@@ -273,6 +273,7 @@ impl Window {
             (None, Some(Status::Expanded)) => self.begin(context, id),
             // It has its resources.
             (None, Some(Status::Granted(_))) => self.proceed_unless_held_back(context, id),
+            (None, Some(Status::Running(_))) => self.take_end(context, id),
             (None, Some(Status::Finished(_))) if instance.is_undecided() => self.decide_by_outcome(context, id),
             (Some(Role::Condition | Role::Test), _) if !has_ended => self.decide(context, id),
             (Some(Role::Loop), _) if !has_ended => self.count(context, id),

@@ -2,7 +2,7 @@
 
 use super::Window;
 use super::beside::is_in_order;
-use super::graph::instance::{Instance, Role};
+use super::graph::instance::{Changed, Ended, Instance, Role};
 use super::growth::environment::Link;
 use super::memory::{Blocked, Looked, Seen, Sight, View, facts_of};
 use super::outside::decides_from;
@@ -10,8 +10,8 @@ use super::waits::Wait;
 use crate::binding::{self, BindError, Outputs};
 use crate::context::Context;
 use crate::plan::{Effects, MAX_OUTCOMES, NodeNature, WAITS};
-use ratn_model::expression::{EffectExpr, FactExpr};
-use ratn_model::fact::Footprint;
+use ratn_model::expression::FactExpr;
+use ratn_model::fact::{FactPattern, Footprint};
 use ratn_model::id::InstanceId;
 use ratn_model::program::StateKind;
 use ratn_model::resource::Requirement;
@@ -134,7 +134,7 @@ impl Window {
             NodeNature::Senses if instance.node().is_some_and(|node| node.is_at_its_place) => None,
             NodeNature::Senses => {
                 let senses = FactExpr::footprint(&context.plan.state(instance.state).senses, view);
-                let writes = |other: &Instance| self.touches(context, other).writes.overlaps(&senses);
+                let writes = |other: &Instance| self.writes(context, other).overlaps(&senses);
                 let writer = others().find(|other| other.is_pia() && writes(other));
                 let about_to = || {
                     let mut waiting = self.graph.heads().filter(|head| {
@@ -147,7 +147,7 @@ impl Window {
             NodeNature::Irreversible => {
                 let mut sensing = others().filter(|other| other.is_sensing() && has_begun(other)).peekable();
                 sensing.peek()?;
-                let writes = self.touches(context, instance).writes;
+                let writes = self.writes(context, instance);
                 let looking = sensing.find(|other| {
                     !self.graph.is_speculative(other.segment)
                         && is_in_order(other, instance)
@@ -160,23 +160,22 @@ impl Window {
 
     /// A detached PIA, older than the instance, that must end before the instance begins or retires, because of conflicting facts or resources.
     pub(super) fn conflict_beside(&self, context: &Context<'_>, instance: &Instance) -> Option<InstanceId> {
+        self.conflict_of_end(context, instance, instance.ended())
+    }
+
+    /// The same for an instance with this end, if it has one.
+    pub(super) fn conflict_of_end(
+        &self,
+        context: &Context<'_>,
+        instance: &Instance,
+        ended: Option<&Ended>,
+    ) -> Option<InstanceId> {
         // A wait reads the root only, and changes nothing.
         if self.graph.detached().is_empty() || context.program.state(instance.state).is_pause() {
             return None;
         }
         let own = context.plan.state(instance.state);
-        let mut mine = self.touches(context, instance);
-        if own.imprecise && instance.is_pia() && instance.ended().is_none() {
-            // It will retire as soon as it ends, whatever its outcome.
-            let writes = self.look(context, instance.id, None, |_, view| {
-                let declared = own.effects.iter().filter_map(|effects| match effects {
-                    Effects::Declared(declared) => Some(EffectExpr::footprint(declared, view)),
-                    Effects::Unknown => None,
-                });
-                declared.fold(Footprint::NOTHING, Footprint::union)
-            });
-            mine.writes = mine.writes.union(writes.unwrap_or(Footprint::NOTHING));
-        }
+        let mine = self.touches(context, instance, ended);
         if let Some(beside) = self.beside_of_shared(context, instance, [&mine.reads, &mine.writes]) {
             return Some(beside);
         }
@@ -190,7 +189,7 @@ impl Window {
             let Some(other) = self.graph.get(*id) else { return false };
             // Facts that concurrent regions share are not ordered.
             let conflicts = || {
-                let its = self.touches(context, other);
+                let its = self.touches(context, other, other.ended());
                 its.writes.overlaps(&mine.reads)
                     || its.writes.overlaps(&mine.writes)
                     || its.reads.overlaps(&mine.writes)
@@ -219,7 +218,7 @@ impl Window {
 
     /// The facts that an instance reads or requires, at its beginning or at its end, and those that it may write: with its outcome if it has
     /// ended, else with any outcome that is computed ahead.
-    fn touches(&self, context: &Context<'_>, instance: &Instance) -> Touches {
+    fn touches(&self, context: &Context<'_>, instance: &Instance, ended: Option<&Ended>) -> Touches {
         self.look(context, instance.id, None, |instance, view| {
             let state = context.program.state(instance.state);
             let own = context.plan.state(instance.state);
@@ -234,8 +233,8 @@ impl Window {
             reads = reads.union(facts_of(&state.annotations.requires, view));
             reads = reads.union(facts_of(decides_from(context.program, instance), view));
             reads = reads.union(FactExpr::footprint(&own.looked_up_at_end, view));
-            let ended = instance.ended().and_then(|ended| own.outcome(&ended.outcome));
-            let outcomes: Vec<usize> = match (instance.marker(), ended) {
+            let by = ended.and_then(|ended| own.outcome(&ended.outcome));
+            let outcomes: Vec<usize> = match (instance.marker(), by) {
                 (Some(marker), _) if marker.role == Role::Exit => vec![marker.leaves_by],
                 (_, Some(outcome)) => vec![outcome],
                 (_, None) => {
@@ -246,7 +245,13 @@ impl Window {
             // A wait does not make the changes that it foresees.
             let outcomes = if state.is_pause() { Vec::new() } else { outcomes };
             let link = |outcome| Link { writer: instance.id, outcome, vague: false };
-            let each = outcomes.into_iter().map(|outcome| view.sight.may_write_along(view, link(outcome)));
+            let each = outcomes.into_iter().map(|outcome| match (&own.effects[outcome], ended.map(|ended| &ended.changes)) {
+                // Of an action without declared effects what it has measured becomes real.
+                (Effects::Unknown, Some(Changed::Declared(measured, _))) if !own.is_routine => {
+                    Footprint::Patterns(measured.iter().map(|(fact, _)| FactPattern::of(fact)).collect())
+                }
+                _ => view.sight.may_write_along(view, link(outcome)),
+            });
             Touches { reads, writes: each.fold(Footprint::NOTHING, Footprint::union) }
         })
         .unwrap_or(Touches { reads: Footprint::NOTHING, writes: Footprint::NOTHING })
@@ -254,7 +259,7 @@ impl Window {
 
     /// The facts that an instance may write.
     pub(super) fn writes(&self, context: &Context<'_>, instance: &Instance) -> Footprint {
-        self.touches(context, instance).writes
+        self.touches(context, instance, instance.ended()).writes
     }
 
     /// The facts that a sensing instance senses.

@@ -212,6 +212,7 @@ impl Window {
                 && head.arm_of(SUCCEEDED).is_some()
                 && context.plan.state(head.state).imprecise
                 && head.node().is_some_and(|node| node.status.is_running())
+                && head.end_to_take().is_none()
         })
     }
 

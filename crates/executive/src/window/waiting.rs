@@ -121,7 +121,7 @@ impl Window {
     pub(super) fn ends_violated(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
         let Some(instance) = self.graph.get(id) else { return false };
         let state = context.program.state(instance.state);
-        if state.annotations.holds.is_empty() {
+        if state.annotations.holds.is_empty() || instance.end_to_take().is_some() {
             return false;
         }
         let ended = match self.in_reality(context, id, |scope| binding::violated(state, scope)) {

@@ -267,6 +267,12 @@ impl Instance {
         self.node().is_some_and(|node| node.nature == NodeNature::Irreversible)
     }
 
+    /// Of a motion whose goal has ended, and whose end is taken when an older motion beside it has ended: that end.
+    pub(crate) fn end_to_take(&self) -> Option<&Ended> {
+        let node = self.node().filter(|node| matches!(node.status, Status::Running(_)) && self.is_pia())?;
+        node.answer.as_deref()
+    }
+
     /// Whether it is an action that looks at the environment.
     pub(crate) fn is_sensing(&self) -> bool {
         self.node().is_some_and(|node| node.nature == NodeNature::Senses)
