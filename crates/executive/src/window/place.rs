@@ -16,7 +16,8 @@ impl Window {
     /// if they have seen what is there now; from now on every try counts. What it requires has to hold now, because the sequential program begins it
     /// now.
     pub(super) fn come_to_its_place(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some(instance) = self.graph.get(id).filter(|instance| self.may_come_to_its_place(instance)) else { return };
+        let comes = |instance: &&Instance| instance.ended().is_none() && self.comes(instance);
+        let Some(instance) = self.graph.get(id).filter(comes) else { return };
         if self.has_tried_otherwise(context, instance) {
             self.graph.forget_tries(id);
             // Without earlier tries there is no backoff.
@@ -33,6 +34,12 @@ impl Window {
             self.stop_node(context, id);
             self.fail(context, id, reason);
         }
+    }
+
+    /// Whether a node that has ended ahead comes to its place, and what it requires does not hold there: the sequential program does not begin it.
+    pub(super) fn fails_at_its_place(&self, context: &Context<'_>, id: InstanceId) -> bool {
+        let comes = self.graph.get(id).is_some_and(|instance| instance.ended().is_some() && self.comes(instance));
+        comes && matches!(self.unmet(context, id), Some(Readiness::Failed(_)))
     }
 
     /// Whether a node begins in the actual world, where its preconditions have to hold. They are checked when it begins and when it has its resources,
@@ -85,9 +92,10 @@ impl Window {
             && self.graph.get(id).is_some_and(|instance| has_resources(instance) && asks(instance))
     }
 
-    fn may_come_to_its_place(&self, instance: &Instance) -> bool {
-        let runs_ahead = instance.node().is_some_and(|node| !node.is_at_its_place) && !instance.is_pia();
-        runs_ahead && instance.is_head && instance.ended().is_none() && self.older_beside(instance).is_none()
+    /// Whether what has run ahead comes to its place: everything older is real.
+    fn comes(&self, instance: &Instance) -> bool {
+        let has_run_ahead = instance.node().is_some_and(|node| !node.is_at_its_place) && !instance.is_pia();
+        has_run_ahead && instance.is_head && self.older_beside(instance).is_none()
     }
 
     /// Whether a node that waits for its next try has made the earlier ones with other inputs. One that is under way has compared them when it began.

@@ -181,7 +181,8 @@ impl Window {
         }
         if is_node {
             self.come_to_its_place(context, id);
-            return self.graph.get(id).is_some_and(is_end);
+            return self.graph.get(id).is_some_and(is_end)
+                || self.fails_at_its_place(context, id) && self.retire_head(context, id);
         }
         has_ended && self.retire_head(context, id)
     }
