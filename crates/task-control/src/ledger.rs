@@ -6,7 +6,7 @@ mod beginnings;
 mod settling;
 
 pub(super) use account::{Account, Created, UsedUp};
-pub(super) use beginnings::{Began, Beginnings};
+pub(super) use beginnings::{Began, Beginnings, Guard};
 pub(super) use settling::{Answers, Settled, Unfinished, created};
 
 use super::record::Decided;
@@ -286,8 +286,10 @@ impl Ledger {
                 let (knew, behind) = (self.knows, self.operations);
                 let now = Began { knows: knew, held_until: None };
                 let began = self.beginnings.of(instance, &writer).unwrap_or(now);
+                let guard = self.beginnings.guard(instance).cloned();
                 if self.failed.is_none() {
-                    self.commits.push(Decided { instance, writer, changes, evidence, revision, began, knew, behind });
+                    let decided = Decided { instance, writer, changes, evidence, revision, began, guard, knew, behind };
+                    self.commits.push(decided);
                 }
             }
             Command::Operate { instance, operations } => {

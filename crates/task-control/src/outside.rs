@@ -101,8 +101,9 @@ mod tests {
             let revision = self.mirror.apply(changes).unwrap_or_default();
             let (instance, writer) = (InstanceId(self.commits), String::new());
             let (changes_made, evidence, began) = (changes.to_vec(), Vec::new(), Began::default());
-            let (knew, behind) = (Revision::default(), 0);
-            let decided = Decided { instance, writer, changes: changes_made, evidence, revision, began, knew, behind };
+            let (guard, knew, behind) = (None, Revision::default(), 0);
+            let decided =
+                Decided { instance, writer, changes: changes_made, evidence, revision, began, guard, knew, behind };
             self.outside.decided("run", &decided);
             (decided.id("run"), changes.to_vec())
         }

@@ -2,7 +2,7 @@
 //! resources. It is one task and makes one change at a time; projections that include a commit are requested while that commit is under way.
 
 use super::decided::{Unanswered, Undone, insist};
-use super::ledger::{Began, Confirmed, Projecting, created, operation_request};
+use super::ledger::{Began, Confirmed, Guard, Projecting, created, operation_request};
 use super::performer::{Answer, Untouched};
 use super::promises::{Made, Promises};
 use super::safe_on_disk::Mark;
@@ -101,6 +101,9 @@ pub(super) struct Decided {
     pub(super) revision: Revision,
     /// How the instance or composite state began.
     pub(super) began: Began,
+    /// What guarded it, if a goal has made it.
+    #[serde(default)]
+    pub(super) guard: Option<Guard>,
     /// The pool's revision that the run had heard of when the commit was decided.
     pub(super) knew: Revision,
     /// Number of operations that were decided before it: the commit is made behind them.

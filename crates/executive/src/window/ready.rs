@@ -245,13 +245,14 @@ impl Window {
             // A wait does not make the changes that it foresees.
             let outcomes = if state.is_pause() { Vec::new() } else { outcomes };
             let link = |outcome| Link { writer: instance.id, outcome, vague: false };
-            let each = outcomes.into_iter().map(|outcome| match (&own.effects[outcome], ended.map(|ended| &ended.changes)) {
-                // Of an action without declared effects what it has measured becomes real.
-                (Effects::Unknown, Some(Changed::Declared(measured, _))) if !own.is_routine => {
-                    Footprint::Patterns(measured.iter().map(|(fact, _)| FactPattern::of(fact)).collect())
-                }
-                _ => view.sight.may_write_along(view, link(outcome)),
-            });
+            let each =
+                outcomes.into_iter().map(|outcome| match (&own.effects[outcome], ended.map(|ended| &ended.changes)) {
+                    // Of an action without declared effects what it has measured becomes real.
+                    (Effects::Unknown, Some(Changed::Declared(measured, _))) if !own.is_routine => {
+                        Footprint::Patterns(measured.iter().map(|(fact, _)| FactPattern::of(fact)).collect())
+                    }
+                    _ => view.sight.may_write_along(view, link(outcome)),
+                });
             Touches { reads, writes: each.fold(Footprint::NOTHING, Footprint::union) }
         })
         .unwrap_or(Touches { reads: Footprint::NOTHING, writes: Footprint::NOTHING })

@@ -14,7 +14,10 @@
 
 use ratn_event_log::without_visits;
 use ratn_executive::protocol::{Command, Event, Note};
-use ratn_model::id::{InstanceId, Revision};
+use ratn_model::id::{InstanceId, LeaseId, Revision};
+use ratn_model::program::WORLD_MODEL;
+use ratn_model::resource::{Lease, Quantity};
+use ratn_proto::types::{Holding, Resource};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -86,12 +89,36 @@ struct Inside {
     is_routine: bool,
 }
 
+/// What guards the facts that a goal changes: the lease under which it was given, and the resources of that, room for a projection left out.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Guard {
+    pub(crate) lease: LeaseId,
+    pub(crate) resources: Vec<String>,
+}
+
+impl Guard {
+    fn of(lease: &Lease) -> Guard {
+        let guards = lease.resources.iter().filter(|resource| resource.kind != WORLD_MODEL);
+        Guard { lease: lease.id, resources: guards.map(|resource| resource.id.clone()).collect() }
+    }
+
+    /// Whether others than this session have a resource of the guard now, and have got it since.
+    pub(crate) fn is_taken(&self, resource: &Resource, session: &str) -> bool {
+        let since = |holding: &Holding| holding.session != session && holding.lease > self.lease;
+        let is_used_up = resource.free == Quantity::default();
+        is_used_up && self.resources.contains(&resource.id) && resource.holdings.iter().any(since)
+    }
+}
+
 /// Everything that has begun and has not ended.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Beginnings {
     /// Paths (without visits) of the composite states that change the world when they are left.
     composites: Vec<String>,
     instances: BTreeMap<InstanceId, Began>,
+    /// Of those that have given a goal.
+    #[serde(default)]
+    guards: BTreeMap<InstanceId, Guard>,
     /// By path.
     entered: BTreeMap<String, Entered>,
     /// The instances in followed states.
@@ -112,7 +139,10 @@ impl Beginnings {
     /// Follows a command of a run that has heard of this revision. The beginning of a commit, [`Beginnings::of`], has to be read before.
     pub(crate) fn command(&mut self, command: &Command, knows: Revision) {
         match command {
-            Command::Start { instance, .. } => self.begins(*instance, knows),
+            Command::Start { instance, goal, .. } => {
+                self.begins(*instance, knows);
+                self.guards.extend(goal.lease.iter().map(|lease| (*instance, Guard::of(lease))));
+            }
             Command::Commit { writer, .. } => drop(self.entered.remove(writer)),
             Command::Note(Note::Expanded { instance, path, .. }) => {
                 let inside = self.inside_of(path);
@@ -133,6 +163,11 @@ impl Beginnings {
         composite.or_else(|| self.instances.get(&instance).copied())
     }
 
+    /// What guards what an instance changes.
+    pub(crate) fn guard(&self, instance: InstanceId) -> Option<&Guard> {
+        self.guards.get(&instance)
+    }
+
     /// The earliest revision after which others' changes count for anything under way that has lost its leases.
     pub(crate) fn others_count(&self) -> Option<Revision> {
         let composites = self.entered.values().map(|entered| &entered.began);
@@ -142,7 +177,7 @@ impl Beginnings {
     /// Whether nothing is under way.
     #[cfg(test)]
     pub(crate) fn is_empty(&self) -> bool {
-        self.instances.is_empty() && self.entered.is_empty() && self.inside.is_empty()
+        self.instances.is_empty() && self.guards.is_empty() && self.entered.is_empty() && self.inside.is_empty()
     }
 
     /// The instance works from now on with what the run holds.
@@ -182,6 +217,7 @@ impl Beginnings {
 
     fn ends(&mut self, instance: InstanceId, is_real: bool) {
         self.instances.remove(&instance);
+        self.guards.remove(&instance);
         let Some(inside) = self.inside.remove(&instance) else { return };
         for path in inside.states {
             let Some(entered) = self.entered.get_mut(&path) else { continue };
@@ -237,8 +273,7 @@ mod tests {
     use crate::shell::changes_at_exit;
     use ratn_executive::protocol::{LogEntry, LogLine, Mode, Natures, Origin};
     use ratn_model::fact::Change;
-    use ratn_model::id::{FencingToken, LeaseId, StateId};
-    use ratn_model::resource::Lease;
+    use ratn_model::id::{FencingToken, StateId};
 
     /// A run that follows these states; what it knows grows with each step.
     struct Bench {

@@ -9,7 +9,7 @@
 
 use super::told::{PENDING_PATIENCE, maker};
 use crate::decided::{Unanswered, Undone, insist};
-use crate::ledger::{Beginnings, Ledger};
+use crate::ledger::{Beginnings, Guard, Ledger};
 use anyhow::bail;
 use ratn_executive::protocol::{Command, Event};
 use ratn_executive::was_overtaken;
@@ -17,7 +17,7 @@ use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::Revision;
 use ratn_model::program::Program;
 use ratn_proto::types::{WorldChange, WorldUpdate};
-use ratn_worker::client::{CallError, WorldClient};
+use ratn_worker::client::{CallError, ResourceClient, WorldClient};
 use ratn_worker::session::Trust;
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
@@ -45,6 +45,8 @@ pub(super) struct ChangedByOthers {
 pub(crate) enum Overtaken {
     /// Others have changed this fact, which the commit changes or is based on.
     By(FactKey),
+    /// Others have got this resource since, which guarded what the commit changes, and still have it: what they have begun is not known.
+    Held(String),
     /// The world pool's history does not reach back to when the run had its resources.
     Unknown,
 }
@@ -56,6 +58,12 @@ impl fmt::Display for Overtaken {
                 write!(
                     f,
                     "others have changed {key}, which it changes or is made of, since the run had what that was made with"
+                )
+            }
+            Overtaken::Held(resource) => {
+                write!(
+                    f,
+                    "others have `{resource}` since then, with which that was made, and may have begun by what was before"
                 )
             }
             Overtaken::Unknown => write!(
@@ -152,13 +160,20 @@ pub(super) struct CameBetween {
     /// The beginnings of all instances, before and after the resumption.
     beginnings: Beginnings,
     changed: ChangedByOthers,
+    resources: ResourceClient,
 }
 
 impl CameBetween {
     /// From the log, and the changes by others.
-    pub(super) fn new(program: &Arc<Program>, run: &str, ledger: &Ledger, changed: ChangedByOthers) -> CameBetween {
-        let beginnings = ledger.beginnings.clone();
-        CameBetween { program: Arc::clone(program), run: run.to_owned(), beginnings, changed }
+    pub(super) fn new(
+        program: &Arc<Program>,
+        run: &str,
+        ledger: &Ledger,
+        changed: ChangedByOthers,
+        resources: &ResourceClient,
+    ) -> CameBetween {
+        let (beginnings, resources) = (ledger.beginnings.clone(), resources.clone());
+        CameBetween { program: Arc::clone(program), run: run.to_owned(), beginnings, changed, resources }
     }
 
     /// The root has reached another revision.
@@ -191,16 +206,22 @@ impl CameBetween {
         let Some(behind) = began.and_then(|began| began.others_count()) else { return Ok(None) };
         match self.changed.overtakes(&self.program, writer, changes, behind) {
             Some(overtaken) => refuse(writer, &overtaken),
-            None => Ok(Some(Untouched::behind(&self.program, &self.run, self.changed.up_to))),
+            None => {
+                let guard = self.beginnings.guard(*instance).cloned();
+                let untouched = Untouched::behind(&self.program, &self.run, self.changed.up_to);
+                Ok(Some(untouched.and_guarded(&self.resources, guard)))
+            }
         }
     }
 }
 
 /// Fails: others have changed what a commit overwrites or is based on.
 pub(super) fn refuse<T>(writer: &str, overtaken: &Overtaken) -> anyhow::Result<T> {
-    bail!(
-        "what {writer} has changed is not in the world yet, and {overtaken}: run the task again, or begin it in the middle (`--from`)"
-    );
+    let next = match overtaken {
+        Overtaken::Held(_) => "resume the run when they have given it back",
+        Overtaken::By(_) | Overtaken::Unknown => "run the task again, or begin it in the middle (`--from`)",
+    };
+    bail!("what {writer} has changed is not in the world yet, and {overtaken}: {next}");
 }
 
 /// The condition of a commit: in the revisions after `seen`, up to the one that the commit is made on, others have not changed what it overwrites or
@@ -213,6 +234,8 @@ pub(crate) struct Untouched {
     seen: Revision,
     /// The commit's number in its run, if the condition only applies when the commit is late.
     late: Option<(Left, Revision)>,
+    /// What the run had lost, if nobody else may have it.
+    guard: Option<(ResourceClient, Guard)>,
 }
 
 /// The deadlines after which the next holders of released resources do not wait for the run's decided commits any more. Clones share them.
@@ -260,12 +283,17 @@ impl Left {
 impl Untouched {
     /// The condition, checked up to revision `seen`.
     pub(super) fn behind(program: &Arc<Program>, run: &str, seen: Revision) -> Untouched {
-        Untouched { program: Arc::clone(program), run: run.to_owned(), seen, late: None }
+        Untouched { program: Arc::clone(program), run: run.to_owned(), seen, late: None, guard: None }
     }
 
     /// Applies the condition only if the run's commit with this number is late.
     pub(super) fn when_late(self, left: &Left, commit: Revision) -> Untouched {
         Untouched { late: Some((left.clone(), commit)), ..self }
+    }
+
+    /// Holds only where nobody else has, instead of the run, what guarded the commit.
+    pub(super) fn and_guarded(self, resources: &ResourceClient, guard: Option<Guard>) -> Untouched {
+        Untouched { guard: guard.map(|guard| (resources.clone(), guard)), ..self }
     }
 
     /// Checks the condition up to another revision.
@@ -278,6 +306,12 @@ impl Untouched {
         (world, trust): (&WorldClient, &Trust),
         (writer, changes): (&str, &[Change]),
     ) -> Result<(), Undone> {
+        if let Some((resources, guard)) = &self.guard {
+            let all = insist(trust, Unanswered::Waits, || resources.list(&[])).await?;
+            if let Some(taken) = all.into_iter().find(|resource| guard.is_taken(resource, &self.run)) {
+                return Err(Undone::Overtaken(Overtaken::Held(taken.id)));
+            }
+        }
         let counts = self.late.as_ref().is_none_or(|(left, commit)| left.is_late(*commit));
         if root <= self.seen || !counts {
             return Ok(());

@@ -460,8 +460,8 @@ impl Performer {
             }
             Command::Commit { instance, writer, changes, evidence, revision } => {
                 let (knew, behind) = (self.told.revision(), self.operations);
-                let began = Began { knows: knew, held_until: None };
-                let decided = Decided { instance, writer, changes, evidence, revision, began, knew, behind };
+                let (began, guard) = (Began { knows: knew, held_until: None }, None);
+                let decided = Decided { instance, writer, changes, evidence, revision, began, guard, knew, behind };
                 let late =
                     || Untouched::behind(&self.program, &self.run, self.root.get()).when_late(&self.left, revision);
                 self.commit(decided, Some(untouched.unwrap_or_else(late)), safe)?;

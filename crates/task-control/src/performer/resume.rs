@@ -296,7 +296,7 @@ impl Performer {
         if let Some(since) = ledger.beginnings.others_count() {
             // Goals that ended well meanwhile, without task control, have to pass the same test.
             let changed = self.changed_by_others(since, revision).await?;
-            self.came_between = Some(CameBetween::new(program, &self.run, ledger, changed));
+            self.came_between = Some(CameBetween::new(program, &self.run, ledger, changed, &self.resources));
         }
         let commit = ledger.commits[..there + made].last().map(|decided| decided.revision).unwrap_or_default();
         // All of these commits are in the root that was read.
@@ -322,7 +322,7 @@ impl Performer {
     /// more.
     fn untouched(&self, program: &Arc<Program>, decided: &Decided, seen: Revision) -> Untouched {
         match decided.began.held_until {
-            Some(_) => Untouched::behind(program, &self.run, seen),
+            Some(_) => Untouched::behind(program, &self.run, seen).and_guarded(&self.resources, decided.guard.clone()),
             None => Untouched::behind(program, &self.run, decided.knew).when_late(&self.left, decided.revision),
         }
     }

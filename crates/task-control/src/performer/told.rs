@@ -352,6 +352,7 @@ mod tests {
             evidence: Vec::new(),
             revision: Revision(12),
             began: Began::default(),
+            guard: None,
             knew: Revision::default(),
             behind: 0,
         };

@@ -91,6 +91,46 @@ async fn what_ended_well_while_the_session_was_lost_is_refused_where_others_have
 }
 
 #[tokio::test]
+async fn what_a_motion_did_is_not_made_real_while_another_run_has_what_guarded_it() -> anyhow::Result<()> {
+    let (mut bench, motion) = (Bench::new().await?, InstanceId(1));
+    bench.ask(motion)?;
+    let lease = bench.granted(motion).await?;
+    let mut ledger = ledger(&bench.performer.run, &[start(motion, 1, "work", lease, "")]);
+    // The run is killed during the motion, and its session ends. Another one is granted the arm, and begins by what the world was before.
+    let mut bench = bench.comes_back(false).await?;
+    let (events, mut answers) = mpsc::channel(8);
+    let mut other = connect(&bench.endpoints, "other", events).await?;
+    other.perform(Command::Acquire { instance: motion, requirements: arm(), priority: 0 })?;
+    let (theirs, _) = granted_after(&mut other, &mut answers).await?;
+    bench.takes_up(ledger.clone(), &World::default()).await?;
+    // The motion has ended well.
+    bench.performer.perform(commits(1, 1))?;
+    let refused = async {
+        loop {
+            let event = bench.event().await.context("nothing is told")?;
+            if let Event::RetirementFailed { reason, .. } = event {
+                break anyhow::Ok(reason);
+            }
+        }
+    };
+    let reason = tokio::time::timeout(SESSION_DEADLINE, refused).await??;
+    assert!(reason.contains("others have `arm` since then"), "{reason}");
+    // The run had decided that: it is made when the other one has given the arm back.
+    bench.loses(&mut ledger).await?;
+    ledger.command(&commits(1, 1));
+    let mut bench = bench.comes_back(false).await?;
+    let refused = bench.takes_up(ledger.clone(), &World::default()).await;
+    assert!(refused.is_err_and(|error| error.to_string().contains("resume the run when they have given it back")));
+    assert_eq!(bench.performer.root().await?.0, Revision(0));
+    other.perform(Command::Release { instance: motion, lease: Some(theirs), projection: None })?;
+    other.closed().await?;
+    let mut bench = bench.comes_back(false).await?;
+    bench.takes_up(ledger, &World::default()).await?;
+    assert_eq!(bench.performer.root().await?.0, Revision(1));
+    bench.performer.closed().await
+}
+
+#[tokio::test]
 async fn what_others_change_when_a_run_has_come_back_stands_against_what_it_began_before() -> anyhow::Result<()> {
     let bench = Bench::new().await?;
     let run = bench.performer.run.clone();

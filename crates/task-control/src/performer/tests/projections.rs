@@ -153,6 +153,7 @@ async fn a_projection_behind_a_commit_that_waits_for_the_disk_leaves_with_it_and
         evidence: Vec::new(),
         revision: Revision(1),
         began: Began::default(),
+        guard: None,
         knew: Revision::default(),
         behind: 0,
     };
