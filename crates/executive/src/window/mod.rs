@@ -334,10 +334,7 @@ impl Window {
 
     /// The path of an instance, with visits.
     fn path(&self, program: &Program, id: InstanceId) -> String {
-        self.graph.get(id).map_or(String::new(), |instance| {
-            let state = program.state(instance.state);
-            instance.environment.path(&state.name, instance.visit, instance.iteration)
-        })
+        self.graph.get(id).map_or(String::new(), |instance| instance.path(program))
     }
 
     fn sight<'a>(&'a self, context: &'a Context<'_>) -> Sight<'a> {

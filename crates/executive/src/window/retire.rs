@@ -299,7 +299,7 @@ impl Window {
     /// Continues the line behind a retired instance, along its outcome.
     fn follow(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: &str, reason: String) {
         let Some(instance) = self.graph.get(id) else { return };
-        let own = context.plan.state(instance.state);
+        let (own, is_node) = (context.plan.state(instance.state), instance.marker().is_none());
         let arm = match instance.marker() {
             None => own.outcome(outcome).and_then(|number| instance.arm_of(number)),
             Some(marker) => match marker.role {
@@ -316,6 +316,12 @@ impl Window {
         if instance.arms.len() > 1 {
             self.take_arm(context, id, arm);
         }
+        if is_node && outcome != SUCCESS {
+            let because = self.because(context, id, reason);
+            let path = self.path(context.program, id);
+            self.graph.explain(&path, &because);
+            self.growth.explain(&path, &because);
+        }
         let Some(instance) = self.graph.get(id) else { return };
         let (line, position, is_detached) = (instance.line, instance.position, instance.is_detached());
         let next = instance.arms.first().and_then(|arm| arm.next);
@@ -327,18 +333,21 @@ impl Window {
 
     /// An instance ended otherwise than computed ahead: discards everything behind it and continues the path where its outcome leads.
     fn leave_path(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: Outcome, reason: String) {
-        let path = self.path(context.program, id);
-        // A routine that was under way says where inside of it.
+        let because = self.because(context, id, reason);
+        self.cut_behind(context, id);
+        self.remove_and_depart(context, id, outcome, because);
+    }
+
+    /// Why an instance ended as it did, for people: the state, and the reason if there is one. A routine that was under way says where inside of it.
+    fn because(&self, context: &Context<'_>, id: InstanceId, reason: String) -> Arc<str> {
         let says_where = self.graph.get(id).is_some_and(|instance| {
             context.plan.state(instance.state).is_routine && instance.node().is_some_and(|node| node.has_acted)
         });
-        let because: Arc<str> = match reason.is_empty() {
-            true => path.into(),
-            false if says_where => reason.into(),
-            false => format!("{path}: {reason}").into(),
-        };
-        self.cut_behind(context, id);
-        self.remove_and_depart(context, id, outcome, because);
+        match (reason.is_empty(), says_where) {
+            (true, _) => self.path(context.program, id).into(),
+            (false, true) => reason.into(),
+            (false, false) => format!("{}: {reason}", self.path(context.program, id)).into(),
+        }
     }
 
     fn remove_and_depart(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: Outcome, because: Arc<str>) {

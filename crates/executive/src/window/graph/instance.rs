@@ -12,7 +12,7 @@ use crate::window::waits::WaitCell;
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::{InstanceId, ProjectionId, StateId};
 use ratn_model::measurement::Evidence;
-use ratn_model::program::{ABORTED, SUCCESS};
+use ratn_model::program::{ABORTED, Program, SUCCESS};
 use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
@@ -265,6 +265,11 @@ impl Instance {
 
     pub(crate) fn is_pia(&self) -> bool {
         self.node().is_some_and(|node| node.nature == NodeNature::Irreversible)
+    }
+
+    /// The path of its state, with visits.
+    pub(crate) fn path(&self, program: &Program) -> String {
+        self.environment.path(&program.state(self.state).name, self.visit, self.iteration)
     }
 
     /// Of a motion whose goal has ended, and whose end is taken when an older motion beside it has ended: that end.

@@ -34,6 +34,7 @@ use ratn_model::id::InstanceId;
 use serde::{Deserialize, Serialize};
 use smallvec::smallvec;
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 /// A fork whose join has not retired.
 #[derive(Debug, Serialize, Deserialize)]
@@ -283,6 +284,17 @@ impl Graph {
     /// The heads of all lines, including those that have not begun.
     pub(crate) fn heads(&self) -> impl Iterator<Item = &Instance> {
         self.lines.heads().filter_map(|id| self.instances.get(id))
+    }
+
+    /// The reason why a path is left by the outcome of a state is known: it was only known which state that is.
+    pub(crate) fn explain(&mut self, path: &str, because: &Arc<str>) {
+        let markers = self.instances.iter_mut().filter_map(|instance| match &mut instance.body {
+            Body::Marker(marker) => Some(marker),
+            Body::Node(_) => None,
+        });
+        for marker in markers.filter(|marker| marker.because.as_deref() == Some(path)) {
+            marker.because = Some(because.clone());
+        }
     }
 
     /// Detached PIAs, oldest first.

@@ -9,7 +9,7 @@ use crate::context::Context;
 use crate::plan::{Outcome, Outcomes};
 use crate::window::graph::Graph;
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{ABORTED, PREEMPTED, Program, StateKind, VIOLATED};
+use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, StateKind, VIOLATED};
 use ratn_model::wait::TIMEOUT;
 use std::sync::Arc;
 
@@ -90,7 +90,11 @@ impl Growth {
                 let ways: Vec<(Outcome, Outcomes, &str)> =
                     arms.iter().map(|arm| (arm.outcome, arm.outcomes, &*own.outcomes[arm.outcome])).collect();
                 let cursors = self.branch(graph, context, index, instance, id, &ways);
+                let path = graph.get(instance).map(|instance| Arc::from(instance.path(context.program)));
                 for ((cursor, outcome), arm) in cursors.into_iter().zip(arms) {
+                    if &*own.outcomes[outcome] != SUCCESS {
+                        self.cursors[cursor].because.clone_from(&path);
+                    }
                     let link = link(outcome, !arm.same_effects);
                     self.come_after(graph, context, cursor, instance, link, (&own.writes, &own.written));
                     self.cursors[cursor].todo = Todo::Leave(id, outcome);

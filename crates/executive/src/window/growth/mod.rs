@@ -203,6 +203,15 @@ impl Growth {
         self.produce(context, index, producer, state, outcome);
     }
 
+    /// The reason why a path is left by the outcome of a state is known: it was only known which state that is.
+    pub(crate) fn explain(&mut self, path: &str, because: &Arc<str>) {
+        let cursors = self.cursors.iter_mut().map(|cursor| &mut cursor.because);
+        let exits = self.regions.values_mut().flat_map(|regions| regions.reasons_mut());
+        for reason in cursors.chain(exits).filter(|reason| reason.as_deref() == Some(path)) {
+            *reason = Some(because.clone());
+        }
+    }
+
     /// An instance decides again: expands the paths behind it again.
     pub(crate) fn reopen(&mut self, graph: &mut Graph, context: &Context<'_>, id: InstanceId) {
         let Some(instance) = graph.get(id) else { return };

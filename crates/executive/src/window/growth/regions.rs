@@ -41,6 +41,13 @@ pub(super) struct Regions {
     waiting: Cursor,
 }
 
+impl Regions {
+    /// The reasons why paths of the regions, or the path up to them, left by an outcome that is not success.
+    pub(super) fn reasons_mut(&mut self) -> impl Iterator<Item = &mut Option<Arc<str>>> {
+        self.ends.iter_mut().flatten().map(|exit| &mut exit.because).chain([&mut self.waiting.because])
+    }
+}
+
 impl Growth {
     /// Enters a concurrency: begins every region.
     pub(super) fn fork(

@@ -10,7 +10,7 @@ use crate::window::graph::Graph;
 use crate::window::graph::instance::Role;
 use ratn_model::expression::scope::NothingKnown;
 use ratn_model::id::StateId;
-use ratn_model::program::{Program, SUCCESS, StateKind, Target};
+use ratn_model::program::{Program, SUCCESS, StateKind, Target, is_failure};
 use std::sync::Arc;
 
 impl Growth {
@@ -170,7 +170,11 @@ impl Growth {
         }
         let by = match &plan.state(id).targets[outcome] {
             Target::State(next) => {
-                self.cursors[index].todo = Todo::Enter(*next);
+                let cursor = &mut self.cursors[index];
+                cursor.todo = Todo::Enter(*next);
+                // What goes on remembers its last failure.
+                let by = &*plan.state(id).outcomes[outcome];
+                cursor.because = cursor.because.take().filter(|_| by == SUCCESS || is_failure(by));
                 return;
             }
             Target::Outcome(by) => by,
