@@ -27,7 +27,7 @@ use crate::hold::Hold;
 use crate::protocol::Event;
 use node::GoalEnd;
 use ratn_model::expression::Given;
-use ratn_model::fact::{Change, Footprint};
+use ratn_model::fact::{Change, FactPattern, Footprint};
 use ratn_model::id::{InstanceId, ProjectionId, Revision, StateId};
 use ratn_model::list::List;
 use ratn_model::measurement::Evidence;
@@ -333,6 +333,17 @@ impl Interpreter {
                 Made { changes: changes[before..].to_vec(), evidence }
             }
         }
+    }
+
+    /// Others have changed these facts after a routine at its place has set or deleted them: that was before, and is over.
+    pub(crate) fn was_overwritten(&mut self, facts: &[FactPattern]) {
+        let Target::Projection { changes, writers, before, evidence, .. } = &mut self.target else { return };
+        let is_over = |change: &Change| !matches!(change, Change::Increase { .. }) && facts.contains(&change.pattern());
+        let own = changes.split_off(*before).into_iter().zip(writers.split_off(*before));
+        let (kept, by): (Vec<Change>, Vec<Arc<str>>) = own.filter(|(change, _)| !is_over(change)).unzip();
+        changes.extend(kept);
+        writers.extend(by);
+        evidence.retain(|(fact, _)| !facts.contains(&FactPattern::of(fact)));
     }
 
     /// A routine at its place goes on with its own changes of the world as it is now: everything before it is real.

@@ -32,6 +32,7 @@ impl Window {
     pub(super) fn world_changed<'a>(&mut self, context: &mut Context<'_>, facts: impl Iterator<Item = &'a FactKey>) {
         let changed: Vec<FactPattern> = facts.map(FactPattern::of).collect();
         self.memory.root_changed(context.root, changed.iter().cloned());
+        self.overwrites(context, &changed);
         let changed = Footprint::Patterns(changed);
         let news = self.memory.take_news_from_outside();
         let all: Vec<InstanceId> = self.graph.iter().map(|instance| instance.id).collect();

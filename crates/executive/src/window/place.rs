@@ -8,6 +8,7 @@ use super::ready::{self, Readiness, not_bound};
 use super::waits::Wait;
 use crate::binding;
 use crate::context::Context;
+use ratn_model::fact::FactPattern;
 use ratn_model::id::InstanceId;
 use ratn_model::program::StateKind;
 
@@ -73,14 +74,30 @@ impl Window {
             self.graph.leave_its_place(id);
             return false;
         }
-        let is_at_its_place = self.graph.get(id).is_some_and(|instance| {
-            let has_come = instance.is_pia() || instance.node().is_some_and(|node| node.is_at_its_place);
-            has_come && instance.is_head && instance.is_under_way() && self.older_beside(instance).is_none()
-        });
+        let is_at_its_place = self.is_under_way_at_its_place(id);
         if is_at_its_place && let Some(routine) = self.graph.interpreter(id) {
             routine.project_anew(context.root);
         }
         is_at_its_place
+    }
+
+    fn is_under_way_at_its_place(&self, id: InstanceId) -> bool {
+        self.graph.get(id).is_some_and(|instance| {
+            let has_come = instance.is_pia() || instance.node().is_some_and(|node| node.is_at_its_place);
+            has_come && instance.is_head && instance.is_under_way() && self.older_beside(instance).is_none()
+        })
+    }
+
+    /// Others have changed facts which a routine under way at its place may have changed before.
+    pub(super) fn overwrites(&mut self, context: &Context<'_>, facts: &[FactPattern]) {
+        for id in self.dispatch.active().collect::<Vec<_>>() {
+            if self.is_under_way_at_its_place(id)
+                && let Some(routine) = self.graph.interpreter(id)
+            {
+                routine.was_overwritten(facts);
+                routine.project_anew(context.root);
+            }
+        }
     }
 
     /// Whether the sequential program only asks for a node's resources at present, and looks at the world when it has them: the node has run ahead, has
