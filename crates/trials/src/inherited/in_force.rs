@@ -17,6 +17,8 @@ pub(super) struct Said {
     pub(super) effects: Option<BTreeMap<String, Vec<EffectExpr>>>,
     pub(super) resources: Option<Vec<ResourceExpr>>,
     pub(super) duration: Option<Expr>,
+    /// Of an action: predicates whose facts are unknown after a failure.
+    pub(super) unknown: Vec<String>,
 }
 
 /// The state's expressions for the inputs of its action.
@@ -53,7 +55,7 @@ pub(super) fn in_force(
         let ends = outcomes.iter().map(String::as_str).chain([SUCCESS]);
         all.effects.extend(ends.map(|outcome| (outcome.to_owned(), Vec::new())));
     }
-    all.effects.extend(effects(state, action, given));
+    all.effects.extend(effects(state, action, given, outcomes));
     let duration = || replaced(action.duration.as_ref()?, given);
     all.duration_s = state.duration.clone().or_else(duration);
     all.resources = state.resources.clone().or_else(|| action.resources.clone()).unwrap_or_default();
@@ -65,20 +67,48 @@ pub(super) fn in_force(
     all
 }
 
+/// The effects of a state by outcome. What the action leaves unknown after a failure, and success would set, is deleted by every other outcome for
+/// which the state says nothing of that predicate.
+fn effects(state: &Said, action: &Said, given: &Inputs, outcomes: &[String]) -> BTreeMap<String, Vec<EffectExpr>> {
+    let mut all = declared(state, action, given);
+    let success = all.get(SUCCESS).into_iter().flatten();
+    let lost: Vec<FactExpr> = success.filter_map(|effect| unknown(effect, action)).collect();
+    for outcome in outcomes.iter().map(String::as_str).chain([ABORTED, PREEMPTED]).filter(|_| !lost.is_empty()) {
+        let said = all.entry(outcome.to_owned()).or_default();
+        let own: BTreeSet<String> = said.iter().filter_map(predicate).collect();
+        said.extend(lost.iter().filter(|fact| !own.contains(&fact.predicate)).cloned().map(EffectExpr::Delete));
+    }
+    all
+}
+
+/// The fact that an effect sets, if that is unknown after a failure: its arguments are known then.
+fn unknown(effect: &EffectExpr, action: &Said) -> Option<FactExpr> {
+    let EffectExpr::Set(fact, _) = effect else { return None };
+    let mut is_known = true;
+    fact.arguments
+        .iter()
+        .flatten()
+        .for_each(|argument| argument.visit(&mut |part| is_known &= !matches!(part, Expr::Output(_))));
+    (is_known && action.unknown.contains(&fact.predicate)).then(|| fact.clone())
+}
+
+fn predicate(effect: &EffectExpr) -> Option<String> {
+    match effect {
+        EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => {
+            Some(fact.predicate.clone())
+        }
+        EffectExpr::ForEach { .. } => None,
+    }
+}
+
 /// The effects of a state by outcome, as far as they are declared.
-fn effects(state: &Said, action: &Said, given: &Inputs) -> BTreeMap<String, Vec<EffectExpr>> {
+fn declared(state: &Said, action: &Said, given: &Inputs) -> BTreeMap<String, Vec<EffectExpr>> {
     let of_action = action.effects.as_ref().and_then(|effects| effects.get(SUCCESS));
     let Some(own) = &state.effects else {
         let whole = of_action.and_then(|effects| each(effects, given, effect));
         return whole.map(|effects| BTreeMap::from([(SUCCESS.to_owned(), effects)])).unwrap_or_default();
     };
     let mut all = own.clone();
-    let predicate = |effect: &EffectExpr| match effect {
-        EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => {
-            Some(fact.predicate.clone())
-        }
-        EffectExpr::ForEach { .. } => None,
-    };
     let said: BTreeSet<String> = own.get(SUCCESS).into_iter().flatten().filter_map(predicate).collect();
     let more = of_action.into_iter().flatten();
     let more = more.filter(|effect| predicate(effect).is_none_or(|predicate| !said.contains(&predicate)));

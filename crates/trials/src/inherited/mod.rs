@@ -39,13 +39,17 @@ pub fn inherited(seed: u64) -> Inherited {
     let mut program = generator::program(seed, &Features::INHERITED);
     let mut dice = Dice(seed ^ 0x1e_4e71_7ed0);
     name_actions(&mut program);
+    // Of its own, so that the other annotations of a seed stay as they are.
+    let mut further = Dice(seed ^ 0x6_1fe4_0117);
     let mut catalogue = Catalogue { resources: written::resources(), ..Catalogue::default() };
     let mut own: BTreeMap<String, Map<String, Json>> = BTreeMap::new();
     let mut expected: BTreeMap<String, Annotations> = BTreeMap::new();
     for state in &program.states {
         let StateKind::Action { provider, action, inputs, outputs } = &state.kind else { continue };
         let given: Inputs = inputs.iter().cloned().collect();
-        let (of_state, of_action) = divided(&state.annotations, &given, &mut dice);
+        let (of_state, mut of_action) = divided(&state.annotations, &given, &mut dice);
+        let success = state.annotations.effects.get(SUCCESS).into_iter().flatten();
+        of_action.unknown = success.filter_map(|effect| set_by(effect).filter(|_| further.percent(30))).collect();
         let is_in_projection = written::is_in_projection(&program, state);
         let mut in_force = in_force(&of_state, &of_action, &given, &state.outcomes, is_in_projection);
         let before = &state.annotations;
@@ -58,7 +62,7 @@ pub fn inherited(seed: u64) -> Inherited {
             optional: optional.map(|name| (name, Type::Any)).collect(),
             outputs: outputs.clone(),
             outcomes: state.outcomes.clone(),
-            annotations: said_by_action(&of_action),
+            annotations: by_input(said_by_action(&of_action), inputs, &mut further),
             ..ActionSignature::default()
         };
         let kind = performer(&state.annotations).to_owned();
@@ -111,6 +115,7 @@ fn as_said(program: &Program, state: &State, all: &Annotations) -> String {
         effects: Some(all.effects.clone()),
         resources: Some(all.resources.clone()),
         duration: all.duration_s.clone(),
+        unknown: Vec::new(),
     };
     let state = State { annotations: all.clone(), ..state.clone() };
     Json::Object(said_by_state(program, &state, &said)).to_string()
@@ -312,6 +317,49 @@ fn said_by_action(said: &Said) -> OfAction {
         effects: said.effects.as_ref().map(|all| all.values().flatten().map(ToString::to_string).collect()),
         resources: said.resources.iter().flatten().map(kind).collect(),
         duration: said.duration.as_ref().map(ToString::to_string),
+        unknown_after_failure: said.unknown.clone(),
         ..OfAction::default()
+    }
+}
+
+/// The same annotations: some of them only where an input is given that the state gives, in place of others that are not in force then. Others are said
+/// for an input that no state gives.
+fn by_input(mut said: OfAction, inputs: &[(String, Expr)], dice: &mut Dice) -> OfAction {
+    let others = || OfAction {
+        reads: Some(vec!["p0(?)".to_owned()]),
+        requires: vec!["1 = 2".to_owned()],
+        effects: Some(vec!["delete p1(?)".to_owned()]),
+        duration: Some("77".to_owned()),
+        ..OfAction::default()
+    };
+    let is_given = |(_, value): &&(String, Expr)| *value != Expr::Literal(ratn_model::value::Value::Null);
+    let input = inputs.iter().find(is_given).map(|(input, _)| input.clone());
+    if let Some(input) = input.filter(|_| dice.percent(30)) {
+        let mut then = OfAction::default();
+        if said.reads.is_some() && dice.percent(50) {
+            then.reads = std::mem::replace(&mut said.reads, others().reads);
+        }
+        if !said.requires.is_empty() && dice.percent(50) {
+            then.requires = std::mem::replace(&mut said.requires, others().requires);
+        }
+        if said.effects.is_some() && !said.computes && dice.percent(50) {
+            then.effects = std::mem::replace(&mut said.effects, others().effects);
+        }
+        if said.duration.is_some() && dice.percent(50) {
+            then.duration = std::mem::replace(&mut said.duration, others().duration);
+        }
+        said.given.insert(input, then);
+    }
+    if dice.percent(20) && !said.computes {
+        said.given.insert(NEVER_GIVEN.to_owned(), others());
+    }
+    said
+}
+
+/// The predicate of the fact that an effect sets.
+fn set_by(effect: &EffectExpr) -> Option<String> {
+    match effect {
+        EffectExpr::Set(fact, _) => Some(fact.predicate.clone()),
+        _ => None,
     }
 }
