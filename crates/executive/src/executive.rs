@@ -144,10 +144,13 @@ impl Executive {
         hold::stopping(program)
     }
 
-    /// What every instance that has not begun waits for, as sentences; empty in HSM mode.
+    /// What every instance that has not begun waits for, as sentences; in HSM mode only those that the operator holds back.
     pub fn explain(&self) -> Vec<String> {
-        let State::Cdtn(window) = &self.state else { return Vec::new() };
-        window.waits(&self.program)
+        match &self.state {
+            State::Cdtn(window) => window.waits(&self.program),
+            State::Hsm(interpreter) => interpreter.held_back(),
+            State::Fresh | State::Leaving(_) | State::Ended => Vec::new(),
+        }
     }
 
     /// Checks the executive's invariants between two events. For tests; costs the whole window.

@@ -108,7 +108,7 @@ pub struct Provider {
 }
 
 /// The joints that a provider moves.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct JointChain {
     /// The robot's name.
     pub robot: String,
@@ -116,6 +116,8 @@ pub struct JointChain {
     pub arm: String,
     /// Joint names from the base to the tool.
     pub joints: Vec<String>,
+    /// The least and the greatest position of each, and their unit (`rad`, `m`). A joint that turns without end has infinite ones.
+    pub limits: Vec<([f64; 2], &'static str)>,
 }
 
 /// The ports of an action, and everything else that a task has to know about it.

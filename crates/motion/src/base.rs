@@ -256,8 +256,9 @@ pub fn check_drive(
     if metres > START_TOLERANCE || radians > START_TOLERANCE {
         return Err(DriveViolation::Start { metres, radians });
     }
-    check_rest(&joints, &trajectory)?;
-    check_limits(&joints, &trajectory)?;
+    let slides = [true, true, false];
+    check_rest(&joints, &slides, &trajectory)?;
+    check_limits(&joints, &slides, &trajectory)?;
     let (vehicle, obstacles) = Vehicle::of(robot, scene, configuration, riding, 0.0);
     let roomy = Vehicle { padding_m: ROOMY_M, ..vehicle.clone() };
     check_way([&vehicle, &roomy], &obstacles, &trajectory)?;

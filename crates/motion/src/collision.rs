@@ -175,7 +175,7 @@ impl fmt::Display for Collision {
         }
         // Rounded to a tenth, so that a distance just below the required one does not read as if it were enough.
         let [apart, kept] = [millimetres, self.padding_m * 1000.0].map(|mm| (10.0 * mm).round() / 10.0);
-        write!(f, "{moving} is only {apart} mm away from {other}, and {kept} mm are kept between them")
+        write!(f, "{moving} is {apart} mm away from {other}: at least {kept} mm are required")
     }
 }
 

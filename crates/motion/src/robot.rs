@@ -289,12 +289,6 @@ impl Robot {
         BUILT_IN.into_iter().map(|(name, ..)| name)
     }
 
-    /// The description of the built-in robot of this name; its URDF is not read.
-    pub fn built_in_description(name: &str) -> Option<RobotDescription> {
-        let (_, description, ..) = BUILT_IN.into_iter().find(|(known, ..)| *known == name)?;
-        RobotDescription::read(description).ok()
-    }
-
     /// The URDF of the built-in robot of this name.
     pub(crate) fn built_in_urdf(name: &str) -> Option<&'static str> {
         BUILT_IN.into_iter().find(|(known, ..)| *known == name).map(|(_, _, urdf, _)| urdf)

@@ -38,17 +38,19 @@ pub enum Violation {
         unit: &'static str,
     },
     /// It does not start or end at rest.
-    #[error("{joint} moves at {velocity:.4} per second at {time_s:.3} s, where the trajectory must be at rest")]
+    #[error("{joint} moves at {velocity:.4} {unit}/s at {time_s:.3} s, where the trajectory must be at rest")]
     NotAtRest {
         /// The joint.
         joint: String,
         /// Its velocity, per second.
         velocity: f64,
+        /// The unit of its position.
+        unit: &'static str,
         /// The time.
         time_s: f64,
     },
     /// A position, velocity, acceleration or jerk exceeds its limit.
-    #[error("{joint} reaches {what} {value:.3} in the part that begins at {time_s:.3} s, its limit is {limit:.3}")]
+    #[error("{joint} reaches {what} {value:.3} {unit} in the part that begins at {time_s:.3} s, its limit is {limit:.3} {unit}")]
     Limit {
         /// The joint.
         joint: String,
@@ -58,18 +60,22 @@ pub enum Violation {
         value: f64,
         /// The limit.
         limit: f64,
+        /// The unit of both.
+        unit: String,
         /// The time.
         time_s: f64,
     },
     /// The acceleration steps, so the jerk has no bound.
     #[error(
-        "the acceleration of {joint} steps by {step:.3} at {time_s:.3} s: its jerk is limited, so it must be continuous"
+        "the acceleration of {joint} steps by {step:.3} {unit}/s² at {time_s:.3} s: its jerk is limited, so it must be continuous"
     )]
     Step {
         /// The joint.
         joint: String,
         /// The size of the step.
         step: f64,
+        /// The unit of the joint's position.
+        unit: &'static str,
         /// The time.
         time_s: f64,
     },
@@ -98,8 +104,8 @@ pub fn validate_trajectory(
 ) -> Result<Curve, Violation> {
     let trajectory = Curve::of_arm(robot, trajectory)?.counted_from(robot.arm_joints(), &here.arm);
     check_start(robot, &here.arm, &trajectory, |_| START_TOLERANCE_RAD)?;
-    check_rest(robot.arm_joints(), &trajectory)?;
-    check_limits(robot.arm_joints(), &trajectory)?;
+    check_rest(robot.arm_joints(), robot.arm_slides(), &trajectory)?;
+    check_limits(robot.arm_joints(), robot.arm_slides(), &trajectory)?;
     let mut checker = Checker::new(robot, scene, here, 0.0);
     check_collisions_while(&mut checker, &trajectory, contact, &mut || true)?;
     Ok(trajectory)
@@ -126,26 +132,26 @@ pub fn check_start(
     Ok(())
 }
 
-/// Checks that it starts and ends at rest.
-pub(crate) fn check_rest(joints: &[Joint], trajectory: &Curve) -> Result<(), Violation> {
+/// Checks that it starts and ends at rest. `slides`: which joints are prismatic.
+pub(crate) fn check_rest(joints: &[Joint], slides: &[bool], trajectory: &Curve) -> Result<(), Violation> {
     let knots = trajectory.knots();
     let moves = |knot: &Knot| (0..joints.len()).find(|j| knot.velocities[*j].abs() > 1e-3);
     match [&knots[0], &knots[knots.len() - 1]].into_iter().find_map(|knot| moves(knot).map(|j| (knot, j))) {
         None => Ok(()),
         Some((knot, j)) => {
             let (joint, velocity) = (joints[j].name.clone(), knot.velocities[j]);
-            Err(Violation::NotAtRest { joint, velocity, time_s: knot.time_s })
+            Err(Violation::NotAtRest { joint, velocity, unit: unit(slides[j]), time_s: knot.time_s })
         }
     }
 }
 
 /// Checks that positions, velocities, accelerations and jerks are within the limits, also between the knots: the extremes of the cubics, in closed
-/// form. If the acceleration steps from one cubic to the next, or from rest, the jerk has no bound.
-pub(crate) fn check_limits(joints: &[Joint], trajectory: &Curve) -> Result<(), Violation> {
+/// form. If the acceleration steps from one cubic to the next, or from rest, the jerk has no bound. `slides`: which joints are prismatic.
+pub(crate) fn check_limits(joints: &[Joint], slides: &[bool], trajectory: &Curve) -> Result<(), Violation> {
     let knots = trajectory.knots();
-    let exceeded = |j: usize, what, value: f64, limit: f64, time_s| {
-        let joint = joints[j].name.clone();
-        Err(Violation::Limit { joint, what, value, limit, time_s })
+    let exceeded = |j: usize, (what, per): (&'static str, &str), value: f64, limit: f64, time_s| {
+        let (joint, unit) = (joints[j].name.clone(), format!("{}{per}", unit(slides[j])));
+        Err(Violation::Limit { joint, what, value, limit, unit, time_s })
     };
     let mut before = JointVector::zeros(joints.len());
     for i in 0..knots.len() {
@@ -157,16 +163,16 @@ pub(crate) fn check_limits(joints: &[Joint], trajectory: &Curve) -> Result<(), V
         for (j, (joint, cubic)) in joints.iter().zip(&cubics).enumerate() {
             let [least, greatest] = cubic.range(0.0, lasts_s);
             if !joint.allows(least, POSITION_TOLERANCE) {
-                return exceeded(j, "position", least, joint.clamp(least), time_s);
+                return exceeded(j, ("position", ""), least, joint.clamp(least), time_s);
             }
             if !joint.allows(greatest, POSITION_TOLERANCE) {
-                return exceeded(j, "position", greatest, joint.clamp(greatest), time_s);
+                return exceeded(j, ("position", ""), greatest, joint.clamp(greatest), time_s);
             }
             let step = (cubic.acceleration - before[j]).abs();
             let used = [
-                ("velocity", cubic.greatest_velocity(), joint.velocity),
-                ("acceleration", cubic.greatest_acceleration(), joint.acceleration),
-                ("jerk", cubic.jerk.abs(), joint.jerk),
+                (("velocity", "/s"), cubic.greatest_velocity(), joint.velocity),
+                (("acceleration", "/s²"), cubic.greatest_acceleration(), joint.acceleration),
+                (("jerk", "/s³"), cubic.jerk.abs(), joint.jerk),
             ];
             for (what, value, limit) in used {
                 if value > limit * (1.0 + LIMIT_TOLERANCE) {
@@ -174,7 +180,7 @@ pub(crate) fn check_limits(joints: &[Joint], trajectory: &Curve) -> Result<(), V
                 }
             }
             if joint.jerk.is_finite() && step > joint.acceleration * LIMIT_TOLERANCE {
-                return Err(Violation::Step { joint: joint.name.clone(), step, time_s });
+                return Err(Violation::Step { joint: joint.name.clone(), step, unit: unit(slides[j]), time_s });
             }
             before[j] = cubic.acceleration_at(lasts_s);
         }

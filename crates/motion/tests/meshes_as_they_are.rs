@@ -108,7 +108,7 @@ fn a_mesh_is_as_far_from_what_stands_around_as_it_is() {
     assert!(!Space::new(&mechanism, &obstacles).is_free(&state(&here.arm)), "its spheres say enough");
     assert_eq!(judged(&mut beside(&robot, vec![table(0.012)])), None);
     let near = judged(&mut beside(&robot, vec![table(0.006)])).unwrap();
-    assert_eq!(near, "link plate is only 6 mm away from table, and 10 mm are kept between them");
+    assert_eq!(near, "link plate is 6 mm away from table: at least 10 mm are required");
     let deep = judged(&mut beside(&robot, vec![table(-0.003)])).unwrap();
     assert!(deep.starts_with("link plate is ") && deep.ends_with(" mm inside table"), "{deep}");
     // What is wholly inside is inside.

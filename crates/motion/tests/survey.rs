@@ -113,7 +113,7 @@ fn how_near_links_with_meshes_are_is_said_by_their_meshes() {
         let faults = faults(apart_m);
         assert!(matches!(&faults[..], [one] if one.ends_with(what)), "{faults:?}");
     };
-    says(0.004, "link cube is only 4 mm away from link foot, and 10 mm are kept between them");
+    says(0.004, "link cube is 4 mm away from link foot: at least 10 mm are required");
     // The spheres that hold the cubes meet there.
     assert_eq!(faults(0.012), Vec::<String>::new());
 }

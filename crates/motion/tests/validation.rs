@@ -77,6 +77,8 @@ fn too_much_jerk_and_a_step_of_the_acceleration_are_refused() {
     };
     assert_eq!(check(&there(joints[0].jerk)), Ok(()));
     let outcome = check(&there(joints[0].jerk * 1.1));
+    let said = outcome.as_ref().err().map(ToString::to_string).unwrap_or_default();
+    assert!(said.contains("reaches jerk ") && said.ends_with(" rad/s³"), "{said}");
     assert!(matches!(outcome, Err(Violation::Limit { what: "jerk", .. })), "{outcome:?}");
     // One cubic from rest to rest: the acceleration is there at once.
     let mut steps = there(joints[0].jerk);
@@ -85,6 +87,8 @@ fn too_much_jerk_and_a_step_of_the_acceleration_are_refused() {
     steps.points[1].time_s = 0.1;
     let outcome = check(&steps);
     let expected = 6.0 * (end - cell.arm[0]) / 0.01;
+    let said = outcome.as_ref().err().map(ToString::to_string).unwrap_or_default();
+    assert!(said.contains(" rad/s² at "), "{said}");
     assert!(matches!(outcome, Err(Violation::Step { step, .. }) if (step - expected).abs() < 1e-9), "{outcome:?}");
 }
 

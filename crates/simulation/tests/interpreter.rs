@@ -269,6 +269,20 @@ impl Bench {
 }
 
 #[test]
+fn who_stands_at_a_breakpoint_waits_for_the_operator_in_either_mode() {
+    for mode in MODES {
+        let mut bench = Bench::new("states: [ go: { MOVE }, on: { MOVE } ]", mode);
+        bench.tell(Event::BreakpointsSet { states: vec!["on".to_owned()] });
+        bench.grant(1, 1);
+        bench.finish(1, 1);
+        let stands = |bench: &Bench| bench.executive.explain().contains(&"on waits for the operator".to_owned());
+        assert!(stands(&bench), "{mode:?}: {:?}", bench.executive.explain());
+        bench.tell(Event::ResumeRequested);
+        assert!(!stands(&bench), "{mode:?}");
+    }
+}
+
+#[test]
 fn while_paused_no_pia_begins_and_what_computes_goes_on() {
     let text = "states:
   - look: { THINK, computes: true, reads: [] }

@@ -70,7 +70,7 @@ pub struct RunStatus {
     pub ended: u64,
     /// The states under way, in the order in which they began.
     pub under_way: Vec<UnderWay>,
-    /// Why states have not begun, one sentence each, up to a maximum number; empty in HSM mode.
+    /// Why states have not begun, one sentence each, up to a maximum number; in HSM mode only those that the operator holds back.
     #[serde(default)]
     pub waits: Vec<String>,
     /// The states that wait for something themselves, with what they wait for.

@@ -142,9 +142,10 @@ impl Progress {
         self.retired
     }
 
-    /// The states under way, in the order in which they began; `usually_s` gives the usual duration of an instance.
+    /// The states under way, in the order in which they began, without those that [wait](Progress::awaiting); `usually_s` gives the usual duration of an instance.
     pub(crate) fn under_way(&self, now: Timestamp, usually_s: impl Fn(InstanceId) -> Option<f64>) -> Vec<UnderWay> {
-        let mut all: Vec<(Timestamp, InstanceId)> = self.started.iter().map(|(id, at)| (*at, *id)).collect();
+        let works = self.started.iter().filter(|(id, _)| !self.awaiting.contains_key(id));
+        let mut all: Vec<(Timestamp, InstanceId)> = works.map(|(id, at)| (*at, *id)).collect();
         all.sort_unstable();
         let one = |(at, id): (Timestamp, InstanceId)| UnderWay {
             path: self.path(id),
@@ -178,8 +179,14 @@ impl Progress {
         }
     }
 
-    /// The lines for one step.
-    pub(crate) fn follow(&mut self, at: Timestamp, event: &Event, commands: &[Command]) -> Vec<String> {
+    /// The lines for one step. `acts` says which instances act on the environment: those are cut short, where others are discarded without a trace.
+    pub(crate) fn follow(
+        &mut self,
+        at: Timestamp,
+        event: &Event,
+        commands: &[Command],
+        acts: impl Fn(InstanceId) -> bool,
+    ) -> Vec<String> {
         let mut lines = Vec::new();
         if self.quiet {
             self.catch_up(at, event, commands.iter());
@@ -303,7 +310,8 @@ impl Progress {
                     say(&mut lines, at, &format!("reuse  {}", self.path(*instance)))
                 }
                 Command::Note(Note::Squashed { instance }) if self.ends(*instance).is_some() => {
-                    say(&mut lines, at, &format!("squash {}", self.path(*instance)));
+                    let what = if acts(*instance) { "cut   " } else { "squash" };
+                    say(&mut lines, at, &format!("{what} {}", self.path(*instance)));
                 }
                 Command::Start { instance, attempt, goal } => {
                     self.started.insert(*instance, at);
@@ -357,17 +365,40 @@ mod tests {
         let expanded = Note::Expanded { instance, state: StateId(1), path: "plan[1]".to_owned(), speculative: false };
         let said = |message: &str| Event::Progressed { instance, attempt: 1, message: message.to_owned() };
         let mut progress = Progress::new(true);
-        progress.follow(Timestamp(0), &said("too early"), &[Command::Note(expanded)]);
+        progress.follow(Timestamp(0), &said("too early"), &[Command::Note(expanded)], |_| false);
         progress.started.insert(instance, Timestamp(0));
-        progress.follow(Timestamp(0), &said("1 of 2"), &[]);
-        progress.follow(Timestamp(0), &said("2 of 2"), &[]);
+        progress.follow(Timestamp(0), &said("1 of 2"), &[], |_| false);
+        progress.follow(Timestamp(0), &said("2 of 2"), &[], |_| false);
         let text = |progress: &Progress| -> Vec<String> {
             progress.under_way(Timestamp::from_seconds(1.5), |_| Some(3.0)).iter().map(UnderWay::text).collect()
         };
         assert_eq!(text(&progress), ["for 1.5 s of about 3.0 s: 2 of 2"]);
-        progress.follow(Timestamp(0), &Event::Woken, &[Command::Note(Note::Retired { instance })]);
+        progress.follow(Timestamp(0), &Event::Woken, &[Command::Note(Note::Retired { instance })], |_| false);
         assert_eq!(text(&progress), [""; 0]);
         progress.started.insert(instance, Timestamp(0));
         assert_eq!(text(&progress), ["for 1.5 s of about 3.0 s"], "what it said before is not said of it again");
+    }
+
+    #[test]
+    fn a_motion_that_is_cut_short_is_told_from_what_is_discarded() {
+        let (moves, plans) = (InstanceId(1), InstanceId(2));
+        let mut progress = Progress::new(false);
+        for (id, path) in [(moves, "move[1]"), (plans, "plan[1]")] {
+            progress.paths.insert(id, path.to_owned());
+            progress.started.insert(id, Timestamp(0));
+        }
+        let squashed = [moves, plans].map(|instance| Command::Note(Note::Squashed { instance }));
+        let lines = progress.follow(Timestamp(0), &Event::Woken, &squashed, |id| id == moves);
+        assert_eq!(lines, ["     0.0 s  cut    move[1]", "     0.0 s  squash plan[1]"]);
+    }
+
+    #[test]
+    fn a_state_that_waits_by_itself_is_not_among_those_under_way() {
+        let instance = InstanceId(1);
+        let awaited = Awaited::Signal { signal: "lid_closed".to_owned() };
+        let awaiting = [Command::Note(Note::Awaiting { instance, awaited, until: None })];
+        let mut progress = Progress::new(false);
+        progress.follow(Timestamp(0), &Event::Woken, &awaiting, |_| false);
+        assert_eq!((progress.awaiting().count(), progress.under_way(Timestamp(0), |_| None)), (1, Vec::new()));
     }
 }

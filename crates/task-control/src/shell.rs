@@ -29,11 +29,12 @@ use ratn_executive::MOST_SIGNALS_KEPT;
 use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::Lookout;
 use ratn_executive::protocol::{Awaited, Command, Event, Learned, Mode, Natures, Origin};
-use ratn_model::catalogue::Catalogue;
+use ratn_model::catalogue::{Catalogue, ResourceOffer};
 use ratn_model::expression::scope::NothingKnown;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::load::suggestion;
 use ratn_model::program::{Exceptions, Nature, Program, SUCCESS, State, StateKind};
+use ratn_model::resource::ResourceClass;
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
@@ -377,6 +378,13 @@ impl Shell {
     /// The same at a given time, when nothing later has happened yet.
     fn decide_at(&mut self, now: Timestamp, event: &Event) -> anyhow::Result<Vec<Command>> {
         let commands = self.executive.handle(now, event.clone());
+        // Before the states of those that are discarded are forgotten.
+        let (program, states) = (&self.program, &self.states);
+        let acts = |instance| {
+            let state = states.get(&instance).map(|id| program.state(*id));
+            state.is_some_and(|state| !state.is_pause() && state.annotations.nature != Nature::Computes)
+        };
+        let lines = self.progress.follow(now, event, &commands, acts);
         commands.iter().for_each(|command| replay::follow(&mut self.states, command));
         self.log.note(now, event, &commands)?;
         for (say, said) in std::mem::take(&mut self.confirm) {
@@ -394,7 +402,7 @@ impl Shell {
         if let Some(spans) = &mut self.spans {
             spans.follow(now, event, &commands);
         }
-        for line in self.progress.follow(now, event, &commands) {
+        for line in lines {
             self.say(&line);
         }
         self.lookout.observe(now, &commands);
@@ -751,10 +759,12 @@ fn natures(program: &Program, catalogue: &Catalogue) -> Natures {
         let meant = program.states.iter().filter(is_action).filter(|state| is_meant(&state.annotations.nature));
         meant.map(|state| state.path.clone()).collect()
     };
+    // A module moves also where a catalogue leaves `actuates` out; who only senses with one is among `senses`.
+    let moves = |offer: &ResourceOffer| offer.actuates || offer.class == ResourceClass::Module;
     Natures {
         computes: actions(|nature| *nature == Nature::Computes),
         senses: actions(|nature| matches!(nature, Nature::Senses(_))),
-        actuating: catalogue.resources.iter().filter(|r| r.1.actuates).map(|r| r.0.clone()).collect(),
+        actuating: catalogue.resources.iter().filter(|one| moves(one.1)).map(|one| one.0.clone()).collect(),
         changes_at_exit: changes_at_exit(program),
     }
 }

@@ -27,9 +27,7 @@ use std::ops::Range;
 #[derive(Debug, thiserror::Error)]
 pub enum PlacementError {
     /// No scene was found in which the task is feasible.
-    #[error(
-        "no feasible scene with {count} objects was found from seed {seed} in {MAX_TABLES} tries; try another seed"
-    )]
+    #[error("{}", no_scene(*count, *seed))]
     Crowded {
         /// Number of objects.
         count: usize,
@@ -68,6 +66,15 @@ pub enum PlacementError {
         /// The requirements that it does not meet, and what to do about each.
         unmet: Vec<Unmet>,
     },
+}
+
+/// The message that no scene was found.
+pub(crate) fn no_scene(count: usize, seed: u64) -> String {
+    format!(
+        "no scene with {count} objects was found from seed {seed} in {MAX_TABLES} tries: they have to stand apart on the [workplace] of the robot, and \
+         the arm has to reach each from above between the others. Take fewer objects, another seed, or a workplace with more room; \
+         `ratn robot check` says what the arm reaches"
+    )
 }
 
 /// Number of tables that are tried.

@@ -5,6 +5,7 @@ use crate::config::{Goods, MAX_BOXES, MAX_TABLEWARE, Setting};
 use crate::core::contacts::Contact;
 use crate::core::faults::{Fault, FaultError, MAX_FAULTS};
 use crate::core::objects::TrueObject;
+use crate::core::placement;
 use crate::core::protocol::Event;
 use crate::core::snapshot::Snapshot;
 use ratn_model::pose::Pose;
@@ -68,9 +69,7 @@ impl Service {
         }
         let (state, count) = (self.handle.reset(seed, goods).await.map_err(status)?, goods.count(self.setting));
         if state.objects.len() != count {
-            let message =
-                format!("no feasible scene with {count} objects was found from seed {seed}; try another seed");
-            return Err(Status::failed_precondition(message));
+            return Err(Status::failed_precondition(placement::no_scene(count, seed)));
         }
         Ok(objects(state))
     }

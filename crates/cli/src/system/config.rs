@@ -17,7 +17,7 @@ use ratn_model::catalogue::{Catalogue, JointChain};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::value::Value;
 use ratn_motion::description::DescriptionError;
-use ratn_motion::robot::Robot;
+use ratn_motion::robot::{Joint, Robot};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::tls::ClientTls;
 use serde::{Deserialize, Serialize};
@@ -260,13 +260,9 @@ impl SystemConfig {
     /// Applies the robot: parts that it does not have are not offered, and the arm's number of joints is set.
     fn fit_robot(&mut self) -> anyhow::Result<()> {
         self.cell.robot.clone_from(&self.robot);
-        // The built-in config has everything that the standard robot has, except the names of its joints.
+        // The built-in config has everything that the standard robot has, except its joints.
         if self.robot == AIMM {
-            self.parts.chain = Robot::built_in_description(AIMM).map(|robot| JointChain {
-                robot: robot.name,
-                arm: robot.arm.name,
-                joints: robot.arm.joints,
-            });
+            self.parts.chain = Robot::built_in(AIMM).as_ref().map(chain_of);
         } else {
             let robot = Robot::named_or_file(&self.robot).map_err(|error| match error {
                 DescriptionError::Read { .. } if !Path::new(&self.robot).exists() => {
@@ -282,11 +278,7 @@ impl SystemConfig {
                 _ => ArmJoints::Various,
             };
             // With several arms it is unknown here which one a goal is for.
-            let chain = robot.other_arms().next().is_none().then(|| JointChain {
-                robot: robot.name().to_owned(),
-                arm: robot.arm_name().to_owned(),
-                joints: robot.arm_joints().iter().map(|joint| joint.name.clone()).collect(),
-            });
+            let chain = robot.other_arms().next().is_none().then(|| chain_of(&robot));
             let modules = Module::of(&robot);
             let mut attributes = ModuleAttributes::new();
             for module in &modules {
@@ -449,6 +441,20 @@ fn is_other_program(template: &Template) -> bool {
     template.python.is_some() || !template.program.as_deref().is_none_or(is_ratn)
 }
 
+/// The joints of a robot's first arm.
+fn chain_of(robot: &Robot) -> JointChain {
+    let limits = |(joint, slides): (&Joint, &bool)| {
+        let limits = if joint.endless { [f64::NEG_INFINITY, f64::INFINITY] } else { joint.limits() };
+        (limits, if *slides { "m" } else { "rad" })
+    };
+    JointChain {
+        robot: robot.name().to_owned(),
+        arm: robot.arm_name().to_owned(),
+        joints: robot.arm_joints().iter().map(|joint| joint.name.clone()).collect(),
+        limits: robot.arm_joints().iter().zip(robot.arm_slides()).map(limits).collect(),
+    }
+}
+
 /// The robot in a worker's arguments, as `--robot=NAME` or `--robot NAME`.
 fn told(args: &[String]) -> Option<&str> {
     let after = |i: usize| args.get(i + 1).map(String::as_str);
@@ -585,6 +591,10 @@ mod tests {
         assert!(six.contains(words) && six.ends_with("), and these are the positions of 7"), "{six}");
         let seven = refusal("", "joints(0, 0, 0)").remove(0);
         assert!(seven.contains("of the robot `aimm` has 7 joints (arm_joint_1, "), "{seven}");
+        for (robot, beyond) in [("", "joints(9, 0, 0, 0, 0, 0, 0)"), ("robot = \"ur5\"", "joints(9, 0, 0, 0, 0, 0)")] {
+            let limits = refusal(robot, beyond).remove(0);
+            assert!(limits.contains(" cannot be at 9 rad: its limits are -"), "{limits}");
+        }
     }
 
     #[test]

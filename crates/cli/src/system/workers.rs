@@ -159,7 +159,8 @@ impl Offered {
         }
         let sentence = |(kind, path): (&str, &str)| {
             format!(
-                "nobody offers a `{kind}`, which `{path}` asks for: the run will wait there. Start a worker with `--kind {kind}`, or add a \
+                "nobody offers a `{kind}`, which `{path}` asks for: the run will wait there. Start a worker with `--kind {kind}`, add what is no \
+                 worker with `ratn resource create {kind}`, or add a \
                  [[process-manager.template]] with kind = \"{kind}\" to the system's config and start the system anew; \
                  `ratn resource list` and `ratn ps` show what there is"
             )

@@ -13,10 +13,17 @@ use ratn_model::name::{KIND_RULE, is_kind};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::process::Stdio;
+use std::time::{Duration, Instant};
 
 /// Maximum standstill time that the resource manager waits for.
 const LONGEST_STANDSTILL_MS: u64 = 60_000;
+/// How long an interpreter may take to say whether it finds a package.
+const PYTHON_PATIENCE: Duration = Duration::from_secs(10);
+/// Ends with [`LACKS_PACKAGE`] if the script that it is given would not find the package `ratn`; the package is not imported.
+const FINDS_PACKAGE: &str = "import importlib.util, os, sys; sys.path[0] = os.path.dirname(sys.argv[1]); \
+                             sys.exit(0 if importlib.util.find_spec('ratn') else 3)";
+const LACKS_PACKAGE: i32 = 3;
 /// Maximum number of workers in a pool.
 const MAX_WORKERS: u32 = 1_000;
 
@@ -337,6 +344,31 @@ impl Template {
         Some(format!("{} runs it ({because})", program.display()))
     }
 
+    /// For a Python worker whose interpreter runs and does not find the package `ratn`: what is missing where, for people. The interpreter is asked
+    /// in the template's environment, as far as that has no substitutions; one that gives no answer in [`PYTHON_PATIENCE`] has the package.
+    pub fn lacks_package(&self) -> Option<String> {
+        let script = self.python.as_deref()?;
+        let Interpreter { program, because } = self.interpreter_of(script);
+        let mut command = std::process::Command::new(&program);
+        command.args(["-c", FINDS_PACKAGE]).arg(script).envs(self.env.iter().filter(|(_, value)| !value.contains('{')));
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+        if let Some(directory) = &self.directory {
+            command.current_dir(directory);
+        }
+        let (mut child, until) = (command.spawn().ok()?, Instant::now() + PYTHON_PATIENCE);
+        let ended = loop {
+            match child.try_wait() {
+                Ok(None) if Instant::now() < until => std::thread::sleep(Duration::from_millis(10)),
+                ended => break ended.ok().flatten(),
+            }
+        };
+        if ended.is_none() {
+            let _ = child.kill().and_then(|()| child.wait().map(drop));
+        }
+        let lacks = ended?.code() == Some(LACKS_PACKAGE);
+        lacks.then(|| format!("{} ({because}) finds no package `ratn`", program.display()))
+    }
+
     /// Reports what is wrong with it; `at` is its place in the config.
     pub(super) fn check(&self, at: &str) -> Result<(), ConfigError> {
         let key = |name: &str| format!("{at}.{name}");
@@ -454,6 +486,7 @@ fn crash_limit() -> u32 {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
 
     #[test]
@@ -472,6 +505,24 @@ mod tests {
         near.settle(Path::new("/project"));
         assert!(near.command_line().starts_with("python3 /project/near.py --id {id} "), "{}", near.command_line());
         assert!(near.obstacle().is_some_and(|why| why.contains("no Python script /project/near.py")));
+    }
+
+    #[test]
+    fn an_interpreter_that_does_not_find_the_package_is_told() {
+        let with = |interpreter: &str| Template {
+            python: Some("near.py".into()),
+            interpreter: Some(interpreter.into()),
+            ..Template::new("near", "Near")
+        };
+        // A program that ends by itself, whatever it is asked, and one that is not there.
+        assert_eq!(with("true").lacks_package(), None);
+        assert_eq!(with("no-such-python").lacks_package(), None);
+        let folder = tempfile::tempdir().unwrap();
+        let script = folder.path().join("python");
+        std::fs::write(&script, "#!/bin/sh\nexit 3\n").unwrap();
+        std::fs::set_permissions(&script, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
+        let lacks = with(&script.display().to_string()).lacks_package().unwrap();
+        assert!(lacks.ends_with("python (the template's `interpreter`) finds no package `ratn`"), "{lacks}");
     }
 
     #[test]

@@ -134,6 +134,13 @@ impl Interpreter {
         true
     }
 
+    /// What waits for the operator, at a breakpoint or while the run is paused: a sentence each, as in CDTN mode.
+    pub(crate) fn held_back(&self) -> Vec<String> {
+        let current = self.threads.values().filter_map(|thread| thread.current.as_ref());
+        let held = current.filter(|current| current.phase == Phase::Held);
+        held.map(|current| format!("{} waits for the operator", current.path)).collect()
+    }
+
     pub(super) fn is_pia(&self, context: &Context<'_>, thread: u64) -> bool {
         let current = self.threads.get(&thread).and_then(|thread| thread.current.as_ref());
         current.is_some_and(|c| context.plan.state(c.state).nature == NodeNature::Irreversible)

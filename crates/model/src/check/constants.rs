@@ -30,23 +30,40 @@ pub(super) fn check(subject: &Subject<'_>, state: &State, slot: Slot<'_>, expr: 
     }
 }
 
-/// The problem of joint positions whose number differs from the provider's.
+/// By how much a position may exceed its limit, in radians or metres, as for the controller of an arm.
+const POSITION_TOLERANCE: f64 = 1e-3;
+
+/// The problem of joint positions that the provider's arm cannot have: their number differs from that of its joints, or one is beyond its limits.
 fn joints(subject: &Subject<'_>, state: &State, slot: Slot<'_>, expr: &Expr, scope: &dyn Scope) -> Option<String> {
     let StateKind::Action { provider, .. } = &state.kind else { return None };
     let known = subject.catalogue.providers.get(provider)?;
     let wanted = known.joints?;
     let Ok(Value::Joints(found)) = expr.evaluate(scope) else { return None };
-    let fits = !matches!(slot, Slot::Input(_)) || usize::try_from(wanted).is_ok_and(|wanted| wanted == found.len());
-    (!fits).then(|| {
-        let count = found.len();
-        match &known.chain {
-            None => format!("`{provider}` has {wanted} joints, and these are the positions of {count}"),
-            Some(JointChain { robot, arm, joints }) => format!(
-                "the arm `{arm}` of the robot `{robot}` has {wanted} joints ({}), and these are the positions of {count}",
-                joints.join(", ")
-            ),
-        }
+    if !matches!(slot, Slot::Input(_)) {
+        return None;
+    }
+    let count = found.len();
+    if usize::try_from(wanted) == Ok(count) {
+        return known.chain.as_ref().and_then(|chain| beyond(chain, &found));
+    }
+    Some(match &known.chain {
+        None => format!("`{provider}` has {wanted} joints, and these are the positions of {count}"),
+        Some(JointChain { robot, arm, joints, .. }) => format!(
+            "the arm `{arm}` of the robot `{robot}` has {wanted} joints ({}), and these are the positions of {count}",
+            joints.join(", ")
+        ),
     })
+}
+
+/// The first position beyond the limits of its joint.
+fn beyond(JointChain { robot, arm, joints, limits }: &JointChain, positions: &[f64]) -> Option<String> {
+    let mut all = joints.iter().zip(limits).zip(positions);
+    let ((joint, ([lower, upper], unit)), q) = all.find(|((_, ([lower, upper], _)), q)| {
+        !(lower - POSITION_TOLERANCE..=upper + POSITION_TOLERANCE).contains(*q)
+    })?;
+    Some(format!(
+        "the joint `{joint}` of the arm `{arm}` of the robot `{robot}` cannot be at {q} {unit}: its limits are {lower:.3} to {upper:.3} {unit}"
+    ))
 }
 
 /// The scope of a state with the defaults of the task's parameters, except parameters that are assigned or hidden by a variable of the same name.

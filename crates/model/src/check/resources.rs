@@ -57,7 +57,12 @@ fn offered(
             // No line of the task names it.
             "the state reads facts, and so needs room for a projection: offer it (`[catalogue.resources.WorldModel]`), or say `reads: []`".to_owned()
         } else {
-            suggestion(&resource.kind, known, "", "offer it in the catalogue, or create it in an older state")
+            let kind = &resource.kind;
+            let offer = format!(
+                "offer it in the catalogue of the system's config (`[catalogue.resources.{kind}]`), also where `ratn resource create {kind}` adds \
+                 one, or create it in an older state"
+            );
+            suggestion(kind, known, "", &offer)
         };
         findings.error("unknown-resource", at, &state.path, message, help);
     }

@@ -19,7 +19,14 @@ pub(super) fn check(findings: &mut Findings, config: &SystemConfig) {
                 obstacle,
                 "if its workers run on another host, this is well there: `ratn doctor` on that host says so",
             ),
-            None => findings.ok(about, template.interpreter().as_deref().unwrap_or("what it starts is there")),
+            None => match template.lacks_package() {
+                Some(lacks) => findings.warning(
+                    about,
+                    lacks,
+                    "install the package there, or name another `interpreter`; a worker that speaks the protocol without it needs none",
+                ),
+                None => findings.ok(about, template.interpreter().as_deref().unwrap_or("what it starts is there")),
+            },
         }
     }
 }
