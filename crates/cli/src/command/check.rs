@@ -24,6 +24,8 @@ use ratn_worker::tls::ClientTls;
 use serde::Serialize;
 use std::path::Path;
 
+/// Rules of findings about an action without a description.
+const NOT_DESCRIBED: [&str; 2] = ["unknown-provider", "unknown-action"];
 /// Maximum number of states shown at the end of a chain; `--json` has all.
 const MAX_LINKS: usize = 40;
 
@@ -54,7 +56,10 @@ pub(crate) fn run(arguments: &CheckArguments, tls: &ClientTls) -> Result<(), Fai
                     Checked { task: None, findings: &findings, workers: &[], sequential: None, obstacle: None };
                 output::result(serde_json::to_string_pretty(&checked)?)?;
             }
-            return Err(refused(&findings));
+            return Err(match system {
+                None => refused_unheard(&findings, &config),
+                Some(_) => refused(&findings),
+            });
         }
     };
     let (program, findings) = (loaded.program, loaded.warnings);
@@ -114,6 +119,9 @@ fn against(arguments: &CheckArguments, tls: &ClientTls) -> Result<(SystemConfig,
         (Some(system), _) => system.config.clone(),
         (None, given) => given.map_or_else(|| SystemConfig::load_for(None, robot), Ok)?,
     };
+    if system.is_none() {
+        config.offer_templates();
+    }
     for file in &arguments.catalogue {
         let said = catalogue::read(file).map_err(|error| Failure::Refused(format!("ratn: {error:#}")))?;
         catalogue::extend(&mut config.catalogue, said);
@@ -237,6 +245,25 @@ pub(super) fn refused(findings: &[Diagnostic]) -> Failure {
     Failure::Refused(lines.join("\n"))
 }
 
+/// Whether the catalogue lacks an action that a worker may still describe.
+pub(super) fn is_lacking(findings: &[Diagnostic]) -> bool {
+    findings.iter().any(|finding| NOT_DESCRIBED.contains(&finding.rule.as_str()))
+}
+
+/// The refusal of a task where no worker was asked: what workers of the config's templates would describe is unknown.
+fn refused_unheard(findings: &[Diagnostic], config: &SystemConfig) -> Failure {
+    let templates = config.may_describe();
+    if templates.is_empty() || !is_lacking(findings) {
+        return refused(findings);
+    }
+    Failure::Refused(format!(
+        "{}\nratn: what workers of the templates `{}` describe is known only where they run: start the system (`ratn up`) and say its directory \
+         (`ratn check --runtime-dir DIR`), or name a file that describes their actions in the config (`catalogues`)",
+        refused(findings),
+        templates.join("`, `")
+    ))
+}
+
 /// The program of a task file, beginning at the state `from` where one is given, or the findings where the task is refused; warnings go to standard
 /// error.
 pub(super) fn found(
@@ -269,4 +296,34 @@ fn accepted(loaded: Result<Loaded, Vec<Diagnostic>>) -> Result<Program, Failure>
 fn told(loaded: Loaded) -> Program {
     loaded.warnings.iter().for_each(output::progress);
     loaded.program
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Debug, Parser)]
+    struct Line {
+        #[command(flatten)]
+        arguments: CheckArguments,
+    }
+
+    #[test]
+    fn a_task_that_uses_what_a_worker_may_describe_is_refused_with_where_to_ask() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = |name: &str, text: &str| {
+            let file = folder.path().join(name);
+            std::fs::write(&file, text).unwrap();
+            file
+        };
+        let template = "[[process-manager.template]]\nname = \"nearest\"\nkind = \"Inspector\"\nprogram = \"true\"\n";
+        let action = "{ action: inspector/nearest, computes: true, reads: [], resources: [Inspector] }";
+        let task = file("t.yaml", &format!("task: t\nstates:\n  - look: {action}\n"));
+        let given = ["check".into(), task, "--config".into(), file("c.toml", template)];
+        let said = run(&Line::parse_from(given).arguments, &ClientTls::none()).unwrap_err().to_string();
+        assert!(said.contains("[unknown-provider]") && said.contains("workers of the templates `nearest`"), "{said}");
+        assert!(!said.contains("[unknown-resource]"), "its template offers it: {said}");
+    }
 }

@@ -125,7 +125,7 @@ async fn begin_on(
         None => match check::found(task, from, &config.catalogue)? {
             Ok(program) => program,
             // A worker of this config may say it of itself once it runs.
-            Err(findings) if described::is_lacking(&findings) && config.starts_other_programs() => {
+            Err(findings) if check::is_lacking(&findings) && !config.may_describe().is_empty() => {
                 let system = started.insert(start(&config, tls, directory, interrupt).await?);
                 Box::pin(described::program(task, from, system, interrupt)).await?
             }

@@ -13,7 +13,7 @@ use ratn_daemon::process_manager::{self, ProcessManagerConfig, Template};
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::service::ServiceConfig;
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
-use ratn_model::catalogue::{Catalogue, JointChain};
+use ratn_model::catalogue::{Catalogue, JointChain, ResourceOffer};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::value::Value;
 use ratn_motion::description::DescriptionError;
@@ -398,9 +398,18 @@ impl SystemConfig {
         promised
     }
 
-    /// Whether templates start workers that are another program than `ratn`, and so may describe actions that the catalogue does not have.
-    pub(crate) fn starts_other_programs(&self) -> bool {
-        self.process_manager.templates.iter().any(is_other_program)
+    /// Adds the kinds of templates that the catalogue leaves out to it, as their workers do where they run.
+    pub(crate) fn offer_templates(&mut self) {
+        for template in &self.process_manager.templates {
+            let offer = || ResourceOffer::new(ResourceClass::Process, template.max_workers());
+            self.catalogue.resources.entry(template.kind.clone()).or_insert_with(offer);
+        }
+    }
+
+    /// The names of the templates whose workers are another program than `ratn`, and so may describe actions that the catalogue does not have.
+    pub(crate) fn may_describe(&self) -> Vec<&str> {
+        let others = self.process_manager.templates.iter().filter(|template| is_other_program(template));
+        others.map(|template| template.name.as_str()).collect()
     }
 
     /// The kinds of resources that perform actions of the catalogue and that neither the cell nor a template offers, each with its providers.

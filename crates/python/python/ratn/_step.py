@@ -144,8 +144,9 @@ def step(
     """Makes a function a step: in a task, its call is a state that a worker of the run performs.
 
     Parameters are as in ``Worker.action``, but the goal may be omitted. A step that says nothing of ``computes``, ``reads``, ``senses`` and ``effects``
-    may do anything, so it runs in its order. One that says any of these has no effects and reads no facts beyond what it says: ``reads=[]`` is enough
-    for one that only computes, which runs ahead, also on ways that are not taken. The worker executes the step's file: code for the program that starts the run
+    may do anything, so it runs in its order. So may one with ``computes=False``, beyond what it says of ``reads`` and ``effects``. Any other one has no
+    effects and reads no facts beyond what it says: ``reads=[]`` is enough for one that only computes, which runs ahead, also on ways that are not
+    taken. The worker executes the step's file: code for the program that starts the run
     belongs below ``if __name__ == "__main__":``.
     """
     # The arguments may be iterators, and are needed twice: here, and by the worker.

@@ -17,14 +17,6 @@ use std::time::{Duration, Instant};
 const PATIENCE: Duration = Duration::from_secs(10);
 /// Interval at which they are asked.
 const POLL: Duration = Duration::from_millis(250);
-/// Rules of findings about an action without a description.
-const NOT_DESCRIBED: [&str; 2] = ["unknown-provider", "unknown-action"];
-
-/// Whether the catalogue lacks an action that a worker may still describe.
-pub(super) fn is_lacking(findings: &[Diagnostic]) -> bool {
-    findings.iter().any(|finding| NOT_DESCRIBED.contains(&finding.rule.as_str()))
-}
-
 /// Loads the task. Where it uses an action that the catalogue does not have, and workers of the system are away, waits for their descriptions.
 pub(super) async fn program(
     task: &Path,
@@ -39,7 +31,7 @@ pub(super) async fn program(
             Ok(program) => return Ok(program),
             Err(findings) => findings,
         };
-        let lacks = is_lacking(&findings);
+        let lacks = check::is_lacking(&findings);
         let awaited = system.offered.awaited();
         if !lacks {
             return Err(check::refused(&findings));
