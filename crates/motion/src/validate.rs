@@ -50,7 +50,9 @@ pub enum Violation {
         time_s: f64,
     },
     /// A position, velocity, acceleration or jerk exceeds its limit.
-    #[error("{joint} reaches {what} {value:.3} {unit} in the part that begins at {time_s:.3} s, its limit is {limit:.3} {unit}")]
+    #[error(
+        "{joint} reaches {what} {value:.3} {unit} in the part that begins at {time_s:.3} s, its limit is {limit:.3} {unit}"
+    )]
     Limit {
         /// The joint.
         joint: String,
