@@ -77,6 +77,12 @@ impl Calls {
         self.under_way.wait().await;
     }
 
+    /// A call under way, for tests of what waits for it.
+    #[cfg(test)]
+    pub(super) fn counted(&self) -> tokio_util::task::task_tracker::TaskTrackerToken {
+        self.under_way.token()
+    }
+
     /// Whether a call is over and it is not known whether its goal has ended.
     pub(super) fn is_unknown(&self) -> bool {
         self.is_unknown.load(Ordering::Acquire)

@@ -123,7 +123,8 @@ pub(crate) struct GoalEntry {
     /// The last intermediate result; every listener gets it, also one that comes later.
     pub(crate) improved: watch::Sender<Option<v1::GoalImproved>>,
     pub(crate) result: watch::Sender<Option<Ending>>,
-    /// Fires when the goal's action has returned, and its calls are over. If an action does not stop in time, this is after its result was sent.
+    /// Fires when the goal's action has returned or panicked, and its calls are over. If an action does not stop in time, this is after its result
+    /// was sent. A panic is recorded before.
     pub(crate) returned: CancellationToken,
     /// The goals that it gave to other providers.
     pub(crate) calls: Calls,

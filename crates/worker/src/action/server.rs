@@ -455,39 +455,79 @@ mod tests {
     use crate::action::ActionResult;
     use ratn_model::id::{FencingToken, LeaseId};
     use ratn_model::resource::{Lease, LeasedResource};
+    use ratn_proto::types::GoalOutcome;
     use ratn_proto::v1::execute_response::Kind;
+    use tokio::time::timeout;
 
-    struct Panics;
+    /// Moves until it is told to stop; then it panics, or stands still.
+    struct Moves {
+        panics: bool,
+    }
 
     #[tonic::async_trait]
-    impl Action for Panics {
+    impl Action for Moves {
         fn name(&self) -> &str {
-            "panics"
+            "move"
         }
 
-        async fn execute(&self, _: GoalContext) -> ActionResult {
-            panic!("on purpose")
+        async fn execute(&self, goal: GoalContext) -> ActionResult {
+            goal.cancelled.cancelled().await;
+            assert!(!self.panics, "on purpose");
+            Ok(GoalOutcome::success())
+        }
+    }
+
+    const OWN: LeaseKey = (LeaseId(7), FencingToken(70));
+
+    /// A server with a goal under way, its messages, and the watch that it listens to.
+    async fn moving(panics: bool) -> (ActionServer, Messages, LeaseWatch) {
+        let server = ActionServer::builder("arm").dangerously_believe_every_lease().action(Moves { panics }).build();
+        let watch = LeaseWatch::of(["arm"]);
+        let listener: Weak<Inner> = Arc::downgrade(&server.inner);
+        watch.listen(listener);
+        let (id, kind, endpoint) = ("arm".to_owned(), "Arm".to_owned(), String::new());
+        let resources = vec![LeasedResource { id, kind, endpoint, superclasses: Vec::new() }];
+        let lease = Lease { id: OWN.0, token: OWN.1, resources, consumed: Vec::new() };
+        let goal = Goal { id: "g".to_owned(), action: "move".to_owned(), lease: Some(lease), ..Goal::default() };
+        let messages = server.admit(&Caller::default(), goal, Fingerprint::of(None)).await.unwrap();
+        (server, messages, watch)
+    }
+
+    async fn may_move(messages: &mut Messages) -> bool {
+        loop {
+            if let Kind::Result(result) = messages.next().await.unwrap().unwrap() {
+                return result.may_move;
+            }
         }
     }
 
     #[tokio::test]
-    async fn what_a_panicked_action_moved_is_not_known_to_stand_still_as_long_as_its_lease_is_ending() {
-        let server = ActionServer::builder("arm").dangerously_believe_every_lease().action(Panics).build();
-        let (id, kind, endpoint) = ("arm".to_owned(), "Arm".to_owned(), String::new());
-        let resources = vec![LeasedResource { id, kind, endpoint, superclasses: Vec::new() }];
-        let lease = Lease { id: LeaseId(7), token: FencingToken(70), resources, consumed: Vec::new() };
-        let goal = Goal { id: "g".to_owned(), action: "panics".to_owned(), lease: Some(lease), ..Goal::default() };
-        let mut messages = server.admit(&Caller::default(), goal, Fingerprint::of(None)).await.unwrap();
-        let result = loop {
-            if let Kind::Result(result) = messages.next().await.unwrap().unwrap() {
-                break result;
+    async fn what_a_panicked_action_moved_is_not_known_to_stand_still_whether_its_lease_ends_before_or_after() {
+        for panics in [true, false] {
+            // The calls of the goal go on for a while, or there are none.
+            for calls in [true, false] {
+                let (server, mut messages, watch) = moving(panics).await;
+                let call = calls.then(|| server.inner.state().running().next().unwrap().calls.counted());
+                let mut before = stands_still(watch.clone());
+                assert!(timeout(Duration::from_millis(5), &mut before).await.is_err(), "it moves");
+                server.cancel("g");
+                tokio::time::sleep(Duration::from_millis(5)).await;
+                drop(call);
+                assert_eq!(may_move(&mut messages).await, panics);
+                for rests in [before, stands_still(watch)] {
+                    let rests = timeout(Duration::from_millis(20), rests).await;
+                    assert_eq!(rests.is_err(), panics, "{calls}");
+                }
+                timeout(Duration::from_secs(9), server.shut_down()).await.unwrap();
+                let under_way = |resource: &str, lease| server.inner.under_way(resource, lease).len();
+                let other = Some((LeaseId(8), FencingToken(80)));
+                assert_eq!([under_way("arm", other), under_way("leg", Some(OWN)), under_way("arm", None)], [0, 0, 0]);
             }
-        };
-        assert!(result.may_move);
-        let under_way = |resource: &str, lease: Option<LeaseKey>| server.inner.under_way(resource, lease).len();
-        let (own, other) = ((LeaseId(7), FencingToken(70)), (LeaseId(8), FencingToken(80)));
-        assert_eq!(under_way("arm", Some(own)), 1);
-        assert!(!server.inner.under_way("arm", Some(own))[0].is_cancelled());
-        assert_eq!([under_way("arm", Some(other)), under_way("leg", Some(own)), under_way("arm", None)], [0, 0, 0]);
+        }
+    }
+
+    /// Returns when it is known that the arm stands still.
+    fn stands_still(watch: LeaseWatch) -> std::pin::Pin<Box<dyn Future<Output = bool>>> {
+        Box::pin(async move { watch.stands_still("arm", OWN).await })
     }
 }

@@ -68,8 +68,8 @@ pub(crate) trait LeaseListener: Send + Sync {
     /// Every lease may have ended, and the manager is given up.
     fn leases_lost(&self, reason: &str);
 
-    /// The running goals of a resource; if a lease (id and token) is given, only that lease's. Each token fires when the goal's action has
-    /// returned.
+    /// The running goals of a resource; if a lease (id and token) is given, only that lease's, and those that have panicked. Each token fires
+    /// when the goal's action has returned, or has panicked just then: ask again. A goal that had panicked before has a token that never fires.
     fn under_way(&self, resource: &str, lease: Option<(LeaseId, FencingToken)>) -> Vec<CancellationToken>;
 }
 

@@ -3,12 +3,13 @@
 //!
 //! ```text
 //!   the watch tells of units that are ending ─▶ the goals of that lease have returned ─▶ ConfirmStandstill
+//!                                                                └─ one has panicked ─▶ nothing: the bound decides
 //! ```
 //! Nothing is confirmed before the driver has reported that it is at rest ([`LeaseWatch::brought_to_rest`]): the lease may be one of an
 //! earlier process, whose motion nobody has stopped.
 //!
 //! Only resources of the provider's own session are confirmed, as long as the provider follows the manager. If a goal's action does not
-//! return, its standstill is never confirmed: then the bound that the resource was offered with (`standstill_ms`) decides.
+//! return, or panics, its standstill is never confirmed: then the bound that the resource was offered with (`standstill_ms`) decides.
 
 use super::{LeaseWatch, RETRY_INTERVAL};
 use crate::client::{CallError, ResourceClient};
@@ -93,11 +94,8 @@ impl LeaseWatch {
             return;
         }
         // No further goal begins under this lease: the watch refutes it.
-        let Some(under_way) = self.shared.under_way(&resource, Some((lease, token))) else {
+        if !self.stands_still(&resource, (lease, token)).await {
             return tracing::debug!(%lease, resource, "no action server has this watch: its standstill is not confirmed");
-        };
-        for goal in under_way {
-            goal.cancelled().await;
         }
         loop {
             match timeout(ANSWERED_WITHIN, client.confirm_standstill(lease, &resource)).await {
@@ -109,6 +107,21 @@ impl LeaseWatch {
                 Err(_) => tracing::debug!(%lease, resource, "the resource manager does not answer to a standstill"),
             }
             sleep(RETRY_INTERVAL).await;
+        }
+    }
+
+    /// Returns true when nothing moves any more for a lease at a resource, which may be never; false if no action server has this watch, so that
+    /// nobody knows.
+    pub(crate) async fn stands_still(&self, resource: &str, lease: (LeaseId, FencingToken)) -> bool {
+        loop {
+            let Some(under_way) = self.shared.under_way(resource, Some(lease)) else { return false };
+            if under_way.is_empty() {
+                return true;
+            }
+            for goal in under_way {
+                goal.cancelled().await;
+            }
+            // Those whose actions have returned are not among them any more; of one that panicked it is not known whether anything moves.
         }
     }
 }
