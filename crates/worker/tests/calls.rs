@@ -30,7 +30,7 @@ enum Arm {
     Brakes,
 }
 
-/// `follow`: moves until it is told to stop, whoever listens; then it brakes until it may stand.
+/// `follow`: moves until it is told to stop; then it brakes until it may stand.
 struct Follow {
     does: watch::Sender<Arm>,
     may_stand: Arc<Semaphore>,
@@ -40,10 +40,6 @@ struct Follow {
 impl Action for Follow {
     fn name(&self) -> &str {
         "follow"
-    }
-
-    fn cancel_when_abandoned(&self) -> bool {
-        false
     }
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {

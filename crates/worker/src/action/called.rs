@@ -30,6 +30,10 @@ use tracing::Instrument;
 /// How long the end of a call that was told to stop is waited for: a provider says after [`STOP_GRACE`] that a goal has not ended.
 const STOPS_WITHIN: Duration = STOP_GRACE.saturating_add(Duration::from_millis(500));
 
+/// How long a called goal goes on without a listener: for as long as it may take to attach to it over another connection. A call that is dropped is
+/// told to stop at once.
+pub(super) const CALL_GRACE_MS: u64 = 1_000;
+
 /// The calls of one goal.
 #[derive(Debug, Default)]
 pub(crate) struct Calls {

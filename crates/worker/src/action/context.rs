@@ -1,6 +1,7 @@
 //! The context of an action: its goal with the inputs, and access to the world model, the lease and other providers.
 
 use super::ActionFailure;
+use super::called::CALL_GRACE_MS;
 use super::goal::GoalEntry;
 use crate::client::{ActionClient, CallError, Channels, WorldClient, retry_unanswered};
 use crate::endpoint::{Endpoint, EndpointError};
@@ -345,8 +346,7 @@ impl GoalContext {
             projection: self.projection,
             world_pool: self.world_pool.clone(),
             deadline_ms: 0,
-            // The caller is a goal itself, and has its own grace.
-            grace_ms: 0,
+            grace_ms: CALL_GRACE_MS,
             improves: None,
         };
         let given_up = || CallFailure::Cancelled { action: name.clone() };
