@@ -286,7 +286,7 @@ impl Performing {
     /// Rare branches are boxed, so that the future of a goal is small: it is copied about ten times on its way through the runtime.
     async fn ending(&self, endpoint: &Endpoint, given: Given) -> Event {
         match given {
-            Given::Now => self.given(endpoint).await,
+            Given::Now => self.given(endpoint, given).await,
             Given::Before | Given::ToStop => match Box::pin(self.found(endpoint)).await {
                 // A process that was started again refuses what was granted before it: the one before may have begun the goal.
                 Event::Crashed { reason, refused: true, .. } => self.unknown(reason),
@@ -308,7 +308,7 @@ impl Performing {
             Err(error)
                 if error.code() == Some(tonic::Code::NotFound) && self.may_be_given_after_all(endpoint).await =>
             {
-                self.given(endpoint).await
+                self.given(endpoint, Given::Before).await
             }
             Err(error) if error.code() == Some(tonic::Code::NotFound) => {
                 self.unknown(format!("nobody knows what became of it while task control was gone: {}", said(&error)))
@@ -335,11 +335,11 @@ impl Performing {
         self.unknown("its worker does not know which goals it was given before (it has no `Attach`)".to_owned())
     }
 
-    async fn given(&self, endpoint: &Endpoint) -> Event {
+    async fn given(&self, endpoint: &Endpoint, given: Given) -> Event {
         let is_wanted = || !self.stop.is_cancelled();
         let fate = self.actions.execute_hearing(endpoint, self.goal.clone(), is_wanted, |said| self.said(said)).await;
-        // A provider that refuses a goal has not begun it.
-        if fate.as_ref().is_err_and(|error| !error.is_crash() && !error.is_unreadable()) {
+        // A provider that refuses a goal has not begun it; the process before it may have, if the goal was given before.
+        if given == Given::Now && fate.as_ref().is_err_and(|error| !error.is_crash() && !error.is_unreadable()) {
             self.may_move.store(false, Ordering::Release);
         }
         match fate.inspect(|fate| self.heard(fate)) {

@@ -398,6 +398,27 @@ async fn it_is_known_that_nothing_moves_where_a_goal_was_refused_or_its_end_was_
 }
 
 #[tokio::test]
+async fn a_goal_of_before_that_a_provider_started_again_refuses_may_have_been_begun() -> anyhow::Result<()> {
+    let bench = Bench::new().await?;
+    for (code, reason) in [(Code::FailedPrecondition, "LEASE_REFUTED"), (Code::ResourceExhausted, "BUSY")] {
+        let bound = bind(&Endpoint::Unix(bench._place.path().join(format!("{reason}.sock")))).await?;
+        let endpoint = bound.endpoint().clone();
+        let details = ErrorDetails::with_error_info(reason, "ratn", HashMap::<String, String>::new());
+        let status = Status::with_error_details(code, "granted before this process was started", details);
+        let services = Services::new().with(ActionServiceServer::new(Elsewhere(Err(status))));
+        tokio::spawn(bound.serve(services, CancellationToken::new()));
+        for (given, may_move) in [(Given::Before, true), (Given::Now, false)] {
+            let performing = bench.performing("work", None, 0);
+            performing.may_move.store(true, Ordering::Release);
+            let event = performing.given(&endpoint, given).await;
+            assert!(matches!(event, Event::Crashed { .. }), "{event:?}");
+            assert_eq!(performing.may_move.load(Ordering::Acquire), may_move, "{reason}: {given:?}");
+        }
+    }
+    Ok(())
+}
+
+#[tokio::test]
 async fn a_worker_that_still_runs_anothers_goal_is_kept_for_a_while_and_not_asked_thrice_at_once() -> anyhow::Result<()>
 {
     let mut bench = Bench::new().await?;
