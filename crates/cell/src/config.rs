@@ -79,7 +79,7 @@ pub struct CellConfig {
     /// How long the session with the resource manager survives without a keep-alive, in milliseconds.
     pub session_ttl_ms: u64,
     /// When a lease of a module that can move has ended, the next lease is granted once the cell has confirmed standstill, at the latest after this many
-    /// milliseconds. At least `session_ttl_ms`, because the cell may learn of the end that late; unless given, 3 s more.
+    /// milliseconds. At least, and unless given, `session_ttl_ms`, because the cell may learn of the end that late, and 3 s of the robot, in which it brakes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub standstill_ms: Option<u64>,
     /// The folder in which an emergency stop is stored so that it survives the process: choose one that a reboot does not empty. By default
@@ -281,13 +281,16 @@ impl CellConfig {
         Goods { boxes, bowls, forks, cups, plates }
     }
 
-    /// The maximum time until the next lease of a module that can move is granted. Braking takes a time in the robot's seconds, which is longer in a
-    /// slowed-down cell; below a speed of 0.06 it exceeds the longest time that is allowed here.
+    /// The maximum time until the next lease of a module that can move is granted.
     pub fn standstill(&self) -> Duration {
+        self.standstill_ms.map_or_else(|| self.stops_within(), Duration::from_millis)
+    }
+
+    /// The time in which the cell has stopped by itself after a lease has ended: it may learn of that only when its own session is over, and its
+    /// actions have returned 3 s later, of the robot where that is slowed down.
+    fn stops_within(&self) -> Duration {
         let ttl = Duration::from_millis(self.session_ttl_ms);
-        let braking = (standstill_bound(ttl) - ttl).div_f64(self.speed.clamp(1e-3, 1.0));
-        let unless_given = (ttl + braking).min(LONGEST_STANDSTILL);
-        self.standstill_ms.map_or(unless_given, Duration::from_millis)
+        ttl + (standstill_bound(ttl) - ttl).div_f64(self.speed.max(1e-3).min(1.0))
     }
 
     /// Checks the rules that the types cannot express.
@@ -311,17 +314,14 @@ impl CellConfig {
             (
                 "session_ttl_ms",
                 self.session_ttl_ms as f64,
-                // The cell stops by itself when its session is over, and its actions have returned 3 s later.
-                standstill_bound(Duration::from_millis(self.session_ttl_ms)) <= LONGEST_STANDSTILL
-                    && self.session_ttl_ms >= 500,
-                "500 to 57000",
+                self.stops_within() <= LONGEST_STANDSTILL && self.session_ttl_ms >= 500,
+                "500 to 57000; below a speed of 1 at most 60000 - 3000 / speed",
             ),
             (
                 "standstill_ms",
                 self.standstill_ms.unwrap_or_default() as f64,
-                self.standstill_ms
-                    .is_none_or(|ms| self.session_ttl_ms <= ms && Duration::from_millis(ms) <= LONGEST_STANDSTILL),
-                "at least session_ttl_ms, and at most 60000",
+                (self.stops_within()..=LONGEST_STANDSTILL).contains(&self.standstill()),
+                "at least session_ttl_ms + 3000, below a speed of 1 session_ttl_ms + 3000 / speed, and at most 60000",
             ),
             (
                 "controllers.arm_stiffness",
@@ -521,8 +521,25 @@ mod tests {
     fn a_cell_that_is_slowed_down_has_longer_to_come_to_rest() {
         let of = |text: &str| toml::from_str::<CellConfig>(text).unwrap().standstill().as_secs_f64();
         assert_eq!((of(""), of("speed = 50.0")), (6.0, 6.0));
-        assert_eq!((of("speed = 0.25"), of("speed = 0.01")), (15.0, 60.0));
-        assert_eq!(of("speed = 0.25\nstandstill_ms = 7000"), 7.0);
+        assert_eq!((of("speed = 0.25"), of("speed = 0.25\nsession_ttl_ms = 5000")), (15.0, 17.0));
+        assert_eq!(of("speed = 0.25\nstandstill_ms = 16000"), 16.0);
+    }
+
+    #[test]
+    fn the_next_holder_is_granted_the_arm_when_the_cell_has_stopped_by_itself_and_not_before() {
+        let refused = |text: &str| toml::from_str::<CellConfig>(text).unwrap().check().err().map(|error| error.key);
+        for (fits, short, key) in [
+            ("session_ttl_ms = 57000", "session_ttl_ms = 57001", "session_ttl_ms"),
+            ("speed = 0.5\nsession_ttl_ms = 54000", "speed = 0.5\nsession_ttl_ms = 57000", "session_ttl_ms"),
+            ("speed = 0.06", "speed = 0.05", "session_ttl_ms"),
+            ("standstill_ms = 6000", "standstill_ms = 5999", "standstill_ms"),
+            ("speed = 0.25\nstandstill_ms = 15000", "speed = 0.25\nstandstill_ms = 7000", "standstill_ms"),
+            ("standstill_ms = 60000", "standstill_ms = 60001", "standstill_ms"),
+        ] {
+            assert_eq!((refused(fits), refused(short)), (None, Some(key)), "{short}");
+        }
+        assert_eq!([refused("speed = nan"), refused("speed = -1.0")], [Some("speed"); 2]);
+        assert_eq!(refused("session_ttl_ms = 9223372036854775807"), Some("session_ttl_ms"));
     }
 
     #[test]
@@ -533,14 +550,10 @@ mod tests {
         let refused = toml::from_str::<CellConfig>(text).unwrap().check().unwrap_err().to_string();
         assert_eq!(
             refused,
-            "`standstill_ms` of the cell is 2999: it must be at least session_ttl_ms, and at most 60000"
+            "`standstill_ms` of the cell is 2999: it must be at least session_ttl_ms + 3000, below a speed of 1 session_ttl_ms + \
+             3000 / speed, and at most 60000"
         );
         let config: CellConfig = toml::from_str("boxes = 10").unwrap();
         assert_eq!(config.check().unwrap_err().to_string(), "`boxes` of the cell is 10: it must be 1 to 9");
-        // The next holder is granted the arm when the cell has stopped by itself, and not before.
-        let with = |ms: u64| toml::from_str::<CellConfig>(&format!("session_ttl_ms = {ms}")).unwrap().check();
-        assert!(with(57_000).is_ok());
-        let refused = with(57_001).unwrap_err().to_string();
-        assert_eq!(refused, "`session_ttl_ms` of the cell is 57001: it must be 500 to 57000");
     }
 }

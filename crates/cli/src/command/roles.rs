@@ -96,8 +96,11 @@ pub(super) fn process_manager(arguments: &RoleArguments, tls: &ClientTls) -> Res
     })
 }
 
-/// Refuses a config with a template that cannot be started on this machine.
+/// Refuses a config with a template that cannot be started on this machine, or with a cell that cannot be slowed down so far.
 pub(super) fn startable(config: &SystemConfig) -> Result<(), Failure> {
+    if config.has_cell() {
+        config.cell.check().map_err(|error| Failure::Refused(format!("ratn: [cell] {error}")))?;
+    }
     let obstacles = config.process_manager.obstacles();
     if obstacles.is_empty() {
         return Ok(());
