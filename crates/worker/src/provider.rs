@@ -358,7 +358,10 @@ impl Shared {
         let missing = |entry: &DesiredState| entry.resource.is_some() && entry.presence != Presence::There;
         desired.states.get(id).is_some_and(missing)
             && match &self.leases {
-                Some(leases) if leases.watches(id) => !leases.is_at_rest(id),
+                // What an action moved that panicked may still move, though no goal runs.
+                Some(leases) if leases.watches(id) => {
+                    !leases.is_at_rest(id) || leases.has_panicked(id) && desired.bounds.may_move(id)
+                }
                 // Nobody knows which goals run beside it.
                 Some(leases) => !leases.is_brought_to_rest() || desired.bounds.may_move(id),
                 None => desired.bounds.may_move(id),

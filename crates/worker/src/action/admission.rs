@@ -252,9 +252,9 @@ impl State {
         }
     }
 
-    /// Whether an action under this lease of a resource has panicked.
-    pub(super) fn has_panicked(&self, resource: &str, lease: LeaseKey) -> bool {
-        self.panicked.iter().any(|(at, under)| at == resource && *under == lease)
+    /// Whether an action at a resource has panicked, under this lease or, without one, under any.
+    pub(super) fn has_panicked(&self, resource: &str, lease: Option<LeaseKey>) -> bool {
+        self.panicked.iter().any(|(at, under)| at == resource && lease.is_none_or(|lease| lease == *under))
     }
 
     /// Records that a goal's action has returned.

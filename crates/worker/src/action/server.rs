@@ -428,10 +428,14 @@ impl LeaseListener for Inner {
     fn under_way(&self, resource: &str, lease: Option<LeaseKey>) -> Vec<CancellationToken> {
         let state = self.state();
         // What a panicked action moved is never known to stand still: this one does not fire.
-        let for_ever = lease.filter(|lease| state.has_panicked(resource, *lease)).map(|_| CancellationToken::new());
+        let for_ever = lease.filter(|_| state.has_panicked(resource, lease)).map(|_| CancellationToken::new());
         let at = state.running().filter(|goal| goal.resource == resource);
         let at = at.filter(|goal| lease.is_none() || goal.lease == lease).map(|goal| goal.returned.clone());
         at.chain(for_ever).collect()
+    }
+
+    fn has_panicked(&self, resource: &str) -> bool {
+        self.state().has_panicked(resource, None)
     }
 }
 

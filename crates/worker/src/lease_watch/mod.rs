@@ -71,6 +71,9 @@ pub(crate) trait LeaseListener: Send + Sync {
     /// The running goals of a resource; if a lease (id and token) is given, only that lease's, and those that have panicked. Each token fires
     /// when the goal's action has returned, or has panicked just then: ask again. A goal that had panicked before has a token that never fires.
     fn under_way(&self, resource: &str, lease: Option<(LeaseId, FencingToken)>) -> Vec<CancellationToken>;
+
+    /// Whether an action at the resource has ever panicked: what it moved may still move, though no goal runs.
+    fn has_panicked(&self, resource: &str) -> bool;
 }
 
 /// The leases of a provider's resources, as far as the resource manager has reported them. A handle: clones share everything.
@@ -212,6 +215,11 @@ impl LeaseWatch {
     /// Whether the driver has called [`LeaseWatch::brought_to_rest`], and no goal runs on the resource, not even one that was told to stop.
     pub fn is_at_rest(&self, resource: &str) -> bool {
         self.is_brought_to_rest() && self.shared.under_way(resource, None).is_none_or(|under_way| under_way.is_empty())
+    }
+
+    /// As [`LeaseListener::has_panicked`], for all listeners.
+    pub(crate) fn has_panicked(&self, resource: &str) -> bool {
+        self.shared.listeners().iter().any(|listener| listener.has_panicked(resource))
     }
 
     /// Follows the manager of a session that provides the resources, for as long as the future is polled. Leases are trusted as long as the

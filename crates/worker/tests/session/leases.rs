@@ -2,16 +2,20 @@
 
 use super::manager::Manager;
 use super::{LONG, TTL, arm, channels, place};
-use ratn_model::id::{FencingToken, LeaseId};
-use ratn_model::resource::ResourceClass;
-use ratn_proto::types::Resource;
+use ratn_model::id::{FencingToken, LeaseId, Revision};
+use ratn_model::resource::{Lease, LeasedResource, Quantity, ResourceClass};
+use ratn_proto::types::{self, Goal, Resource, ResourceUpdate};
 use ratn_proto::v1::{EndingUnits, Holding};
-use ratn_worker::action::ActionServer;
+use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
 use ratn_worker::boot_clock::BootClock;
+use ratn_worker::client::ActionClient;
+use ratn_worker::endpoint::Endpoint;
 use ratn_worker::lease_watch::{Claim, ClaimStatus, LeaseWatch, ManagerLocation};
 use ratn_worker::provider::Provider;
+use ratn_worker::server::{Services, bind};
 use ratn_worker::session::Session;
-use std::time::Duration;
+use std::time::{Duration, Instant};
+use tokio_util::sync::CancellationToken;
 
 /// A manager at which session `cell` provides the arm, of which another one holds lease 7.
 fn with_lease() -> Manager {
@@ -191,4 +195,55 @@ async fn what_moves_beside_the_goals_is_offered_by_the_next_provider_of_the_proc
         assert!(!is_next || begun.elapsed() >= bound, "{:?}", begun.elapsed());
         session.close().await;
     }
+}
+
+/// Begins a motion, and panics.
+struct Panics;
+
+#[tonic::async_trait]
+impl Action for Panics {
+    fn name(&self) -> &str {
+        "move"
+    }
+
+    async fn execute(&self, _: GoalContext) -> ActionResult {
+        panic!("on purpose")
+    }
+}
+
+#[tokio::test]
+async fn what_an_action_that_panicked_moved_is_offered_again_when_its_bound_has_passed() {
+    let (directory, endpoint) = place();
+    let manager = Manager::new();
+    let _serving = manager.serve(&endpoint).await;
+    let (channels, leases) = (channels(), LeaseWatch::of(["arm@sim"]));
+    leases.brought_to_rest();
+    let server = ActionServer::builder("arm@sim").action(Panics).leases(&leases).build();
+    let driver = bind(&Endpoint::Unix(directory.path().join("driver.sock"))).await.unwrap();
+    let at = driver.endpoint().clone();
+    tokio::spawn(driver.serve(Services::new().with(server.into_service()), CancellationToken::new()));
+    let session = Session::open(&channels, &endpoint, "cell", TTL);
+    session.alive(LONG).await.unwrap();
+    let provider = Provider::start_at_rest(&channels, &endpoint, &session, &leases).unwrap();
+    let bound = Duration::from_millis(700);
+    let mut arm = arm().with_standstill(bound);
+    assert!(provider.offer(arm.clone()).await.unwrap());
+    let (lease, token, session) = (LeaseId(7), FencingToken(70), "run".to_owned());
+    let (holder, opened_by, units) = (String::new(), String::new(), Quantity::ONE);
+    arm.holdings = vec![types::Holding { lease, token, units, session: session.clone(), holder, opened_by }];
+    leases.tell(&ResourceUpdate::Snapshot { revision: Revision(1), resources: vec![arm], youngest: lease });
+    let (id, kind, superclasses) = ("arm@sim".to_owned(), "Arm".to_owned(), Vec::new());
+    let resources = vec![LeasedResource { id, kind, endpoint: at.to_string(), superclasses }];
+    let lease = Some(Lease { id: lease, token, resources, consumed: Vec::new() });
+    let goal = Goal { id: "g".to_owned(), action: "move".to_owned(), lease, session, ..Goal::default() };
+    let outcome = ActionClient::new(channels).execute(&at, goal, |_, _| {}).await.unwrap();
+    assert!(outcome.reason.contains("panicked"), "{outcome:?}");
+    {
+        let mut pool = manager.pool.lock().unwrap();
+        pool.sessions.clear();
+        pool.resources.clear();
+    }
+    let lost = Instant::now();
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+    assert!(lost.elapsed() >= bound, "after {:?}", lost.elapsed());
 }
