@@ -42,7 +42,7 @@ pub struct QuotaConfig {
     pub unread_bytes: usize,
     /// Bytes of unread answers to all callers that are not operators.
     pub unread_bytes_of_all: usize,
-    /// A connection whose client takes no part of such answers for so long is closed, in milliseconds.
+    /// A connection whose client takes nothing of such answers for so long is closed, in milliseconds.
     pub unread_ms: u64,
     /// Open connections: a new one replaces the one that has been silent for longest. Has to be below the process's limit of open files.
     pub connections: usize,

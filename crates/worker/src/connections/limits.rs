@@ -24,7 +24,7 @@ pub struct ConnectionLimits {
     pub first_call: Duration,
     /// Maximum time without a call under way.
     pub idle: Duration,
-    /// Maximum time in which the client takes no part of the answers that wait for it, of those that count ([`crate::gate::Gate::unread`]).
+    /// Maximum time in which the client takes nothing of the answers that wait for it, of those that count ([`crate::gate::Gate::unread`]).
     pub unread: Duration,
 }
 

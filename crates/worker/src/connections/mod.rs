@@ -66,7 +66,7 @@ struct Open {
     calls: usize,
     /// Parts of answers that wait for the client.
     unread: usize,
-    /// Since when the client has taken none of them.
+    /// Since when the client has taken nothing of them.
     unread_since: Instant,
     /// The caller for whom the connection is counted while it is in use.
     caller: Option<Caller>,
@@ -212,6 +212,19 @@ impl Link {
             open.unread += 1;
         }
         Waits(self.clone())
+    }
+
+    /// The client takes something of what waits for it.
+    pub(crate) fn takes(&self) {
+        if let Some(open) = self.connections.state().open.get_mut(&self.id) {
+            open.unread_since = Instant::now();
+        }
+    }
+
+    /// How many parts wait, and since when the client has taken nothing.
+    #[cfg(test)]
+    pub(crate) fn unread(&self) -> Option<(usize, Instant)> {
+        self.connections.state().open.get(&self.id).map(|open| (open.unread, open.unread_since))
     }
 
     fn taken(&self) {
