@@ -290,7 +290,9 @@ impl CellConfig {
     /// actions have returned 3 s later, of the robot where that is slowed down.
     fn stops_within(&self) -> Duration {
         let ttl = Duration::from_millis(self.session_ttl_ms);
-        ttl + (standstill_bound(ttl) - ttl).div_f64(self.speed.max(1e-3).min(1.0))
+        // What is no number is refused elsewhere.
+        let speed = if self.speed.is_nan() { 1.0 } else { self.speed.clamp(1e-3, 1.0) };
+        ttl + (standstill_bound(ttl) - ttl).div_f64(speed)
     }
 
     /// Checks the rules that the types cannot express.

@@ -51,7 +51,7 @@ pub(super) enum Record {
     Commit {
         decided: Decided,
         /// The condition under which it is made, if the run has lost, or given back, the leases with which it was made.
-        untouched: Option<Untouched>,
+        untouched: Option<Box<Untouched>>,
         /// What has to be safe on disk first.
         safe: Option<Mark>,
     },
@@ -218,7 +218,7 @@ impl Recorder {
                     let committing = async {
                         match refused {
                             Some(refused) => Some(refused),
-                            None => self.commit(instance, decided.commit(&self.run), untouched).await,
+                            None => self.commit(instance, decided.commit(&self.run), untouched.map(|it| *it)).await,
                         }
                     };
                     let mut committing = pin!(trace::within(self.of(instance), committing));

@@ -214,7 +214,7 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
         };
         shell.step(begun)
     };
-    shell.run_to_its_end(begin, interrupt).await
+    Box::pin(shell.run_to_its_end(begin, interrupt)).await
 }
 
 /// Checks breakpoints of a program, given by the paths of states with or without visits.

@@ -345,7 +345,7 @@ impl Template {
     }
 
     /// For a Python worker whose interpreter runs and does not find the package `ratn`: what is missing where, for people. The interpreter is asked
-    /// in the template's environment, as far as that has no substitutions; one that gives no answer in [`PYTHON_PATIENCE`] has the package.
+    /// in the template's environment, as far as that has no substitutions; one that gives no answer in 10 s has the package.
     pub fn lacks_package(&self) -> Option<String> {
         let script = self.python.as_deref()?;
         let Interpreter { program, because } = self.interpreter_of(script);

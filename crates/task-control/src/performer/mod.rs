@@ -499,7 +499,7 @@ impl Performer {
     fn commit(&mut self, decided: Decided, untouched: Option<Untouched>, safe: Option<Mark>) -> anyhow::Result<()> {
         self.outside.decided(&self.run, &decided);
         self.decided = decided.revision;
-        self.record(Record::Commit { decided, untouched, safe })
+        self.record(Record::Commit { decided, untouched: untouched.map(Box::new), safe })
     }
 
     fn operate(

@@ -275,7 +275,7 @@ fn is_refused<T>(done: anyhow::Result<T>) -> bool {
 async fn what_others_changed_stands_against_a_commit_however_often_its_run_is_taken_up_since() -> anyhow::Result<()> {
     for lives in [true, false] {
         // The log has the commit, although a resumption was refused for it.
-        let (bench, mut ledger, number) = taken_up_once().await?;
+        let (bench, mut ledger, number) = Box::pin(taken_up_once()).await?;
         ledger.command(&commits(1, 3));
         let mut bench = bench.comes_back_to(number, lives).await?;
         assert_eq!(bench.performer.is_own, lives);
@@ -283,7 +283,7 @@ async fn what_others_changed_stands_against_a_commit_however_often_its_run_is_ta
         assert!(is_refused(bench.finishes(ledger).await), "lives: {lives}");
         assert_eq!(bench.performer.root().await?.0, Revision(2));
         // The run was killed once more, during the motion.
-        let (bench, ledger, number) = taken_up_once().await?;
+        let (bench, ledger, number) = Box::pin(taken_up_once()).await?;
         let mut bench = bench.comes_back_to(number, lives).await?;
         bench.takes_up(ledger, &World::default()).await?;
         assert!(is_refused(bench.performer.perform(commits(1, 3))), "lives: {lives}");
