@@ -79,7 +79,7 @@ pub struct CellConfig {
     /// How long the session with the resource manager survives without a keep-alive, in milliseconds.
     pub session_ttl_ms: u64,
     /// When a lease of a module that can move has ended, the next lease is granted once the cell has confirmed standstill, at the latest after this many
-    /// milliseconds. At least, and unless given, `session_ttl_ms`, because the cell may learn of the end that late, and 3 s of the robot, in which it brakes.
+    /// milliseconds. By default, and at least, `session_ttl_ms` (the cell may learn of the end that late) and 3 s of the robot, in which it brakes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub standstill_ms: Option<u64>,
     /// The folder in which an emergency stop is stored so that it survives the process: choose one that a reboot does not empty. By default
@@ -300,6 +300,7 @@ impl CellConfig {
     /// # Errors
     /// [`ConfigError`] names the first invalid value.
     pub fn check(&self) -> Result<(), ConfigError> {
+        let is_slow = self.speed < 1.0;
         let rules = [
             ("boxes", self.boxes as f64, (1..=MAX_BOXES).contains(&self.boxes), "1 to 9"),
             ("bowls", self.bowls as f64, self.bowls <= MAX_TABLEWARE, "0 to 3"),
@@ -317,13 +318,21 @@ impl CellConfig {
                 "session_ttl_ms",
                 self.session_ttl_ms as f64,
                 self.stops_within() <= LONGEST_STANDSTILL && self.session_ttl_ms >= 500,
-                "500 to 57000; below a speed of 1 at most 60000 - 3000 / speed",
+                match is_slow {
+                    true => {
+                        "500 to 60000 - 3000 / speed, so that what moves has stopped within a minute: raise the speed or lower it"
+                    }
+                    false => "500 to 57000",
+                },
             ),
             (
                 "standstill_ms",
                 self.standstill_ms.unwrap_or_default() as f64,
                 (self.stops_within()..=LONGEST_STANDSTILL).contains(&self.standstill()),
-                "at least session_ttl_ms + 3000, below a speed of 1 session_ttl_ms + 3000 / speed, and at most 60000",
+                match is_slow {
+                    true => "session_ttl_ms + 3000 / speed to 60000",
+                    false => "session_ttl_ms + 3000 to 60000",
+                },
             ),
             (
                 "controllers.arm_stiffness",
@@ -550,11 +559,7 @@ mod tests {
         assert!(toml::from_str::<CellConfig>("[gripper]\nopen = 1").is_err());
         let text = "standstill_ms = 2999";
         let refused = toml::from_str::<CellConfig>(text).unwrap().check().unwrap_err().to_string();
-        assert_eq!(
-            refused,
-            "`standstill_ms` of the cell is 2999: it must be at least session_ttl_ms + 3000, below a speed of 1 session_ttl_ms + \
-             3000 / speed, and at most 60000"
-        );
+        assert_eq!(refused, "`standstill_ms` of the cell is 2999: it must be session_ttl_ms + 3000 to 60000");
         let config: CellConfig = toml::from_str("boxes = 10").unwrap();
         assert_eq!(config.check().unwrap_err().to_string(), "`boxes` of the cell is 10: it must be 1 to 9");
     }

@@ -142,7 +142,8 @@ impl Progress {
         self.retired
     }
 
-    /// The states under way, in the order in which they began, without those that [wait](Progress::awaiting); `usually_s` gives the usual duration of an instance.
+    /// The states under way, in the order in which they began, without those that [wait](Progress::awaiting); `usually_s` gives the usual duration
+    /// of an instance.
     pub(crate) fn under_way(&self, now: Timestamp, usually_s: impl Fn(InstanceId) -> Option<f64>) -> Vec<UnderWay> {
         let works = self.started.iter().filter(|(id, _)| !self.awaiting.contains_key(id));
         let mut all: Vec<(Timestamp, InstanceId)> = works.map(|(id, at)| (*at, *id)).collect();

@@ -17,6 +17,7 @@ use std::time::{Duration, Instant};
 const PATIENCE: Duration = Duration::from_secs(10);
 /// Interval at which they are asked.
 const POLL: Duration = Duration::from_millis(250);
+
 /// Loads the task. Where it uses an action that the catalogue does not have, and workers of the system are away, waits for their descriptions.
 pub(super) async fn program(
     task: &Path,
