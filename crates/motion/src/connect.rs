@@ -3,7 +3,7 @@
 //! domain, Yershova et al., ICRA 2005) and make shorter motions now and then. If most extensions of a tree fail, an extension that succeeds goes
 //! on as long as it comes nearer to the other tree. A robot with several arms moves one after the other first (`branches`).
 //!
-//! The same space, ends, seed and budget give the same path. The caller is asked every `POLL` iterations whether to go on.
+//! The same space, ends, seed and budget give the same path. The caller is asked whether to go on after every `POLL` of work.
 
 use crate::ahead::Ahead;
 use crate::branches::{together, with};
@@ -51,8 +51,10 @@ const SHORT_FROM: usize = 4096;
 const SHORT_EVERY: usize = 4;
 const SHORT: f32 = 0.5;
 
-/// Iterations between two calls of the caller's `control`: some tens of microseconds.
-const POLL: usize = 32;
+/// Work between two calls of the caller's `control`, where a sample is 1 and a motion towards it `MOTION` more: some tens of microseconds. The caller
+/// reads a clock, which takes as long as several samples that are too far from a tree to make a motion.
+const POLL: usize = 256;
+const MOTION: usize = 7;
 
 /// Postures searched per target, and attempts to find them.
 const POSTURES: usize = 8;
@@ -416,10 +418,13 @@ fn grow_by(
     let mut ahead = Ahead::new(sample);
     // If motions have to be free between their postures, an iteration takes as long as many others.
     let poll = if space.is_swept() { 1 } else { POLL };
+    let mut work = 0;
     for iteration in 1..=iterations {
-        if iteration % poll == 0 {
+        if work >= poll {
             go_on(control, iteration)?;
+            work = 0;
         }
+        work += 1;
         let (own, others) = (trees[growing].len() as f32, trees[1 - growing].len() as f32);
         if others < BALANCE * own {
             growing = 1 - growing;
@@ -437,6 +442,7 @@ fn grow_by(
         if tree.radii[near] < far {
             continue;
         }
+        work += MOTION;
         let from = tree.states[near];
         let step = step(iteration, tree.radii[near]);
         let next = if drawn.touches == Some(step) { None } else { Some(towards(&from, &sample, far, step)) };

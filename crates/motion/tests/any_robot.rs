@@ -477,6 +477,29 @@ fn a_search_that_is_cancelled_or_out_of_iterations_ends_and_says_so() {
 }
 
 #[test]
+fn a_search_asks_less_often_where_most_samples_are_too_far_from_a_tree_for_a_motion() {
+    let (urdf, names) = chain(6);
+    let mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+    // The arm cannot leave this tunnel, so its tree stays small and gets nearly all samples.
+    let side = |y: f64, z: f64| {
+        let half = if z == 0.0 { [1.0, 0.01, 0.2] } else { [1.0, 0.2, 0.01] };
+        Obstacle { name: format!("{y} {z}"), pose: Pose::at(1.3, y, z), geometry: Geometry::Box { half } }
+    };
+    let mut space = Space::new(&mechanism, &[side(0.12, 0.0), side(-0.12, 0.0), side(0.0, 0.12), side(0.0, -0.12)]);
+    let state = |first: f32| -> State { std::array::from_fn(|j| if j == 0 { first } else { 0.0 }) };
+    let mut asked = 0;
+    let mut count = |_: usize| {
+        asked += 1;
+        Control::Continue
+    };
+    let few = Budget { iterations: 6400, seed: 0 };
+    let outcome = connect(&mut space, &state(0.0), &[state(2.0)], few, &mut count);
+    assert_eq!(outcome, Err(ConnectError::Exhausted { iterations: 6400 }));
+    // A question for every 32 samples would make 200.
+    assert!((25..100).contains(&asked), "asked {asked} times");
+}
+
+#[test]
 fn a_cancel_is_noticed_within_five_milliseconds_during_search_and_simplification() {
     let (urdf, names) = chain(6);
     let mechanism = Mechanism::read(&urdf, None, &names).unwrap();
